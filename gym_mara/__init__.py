@@ -1,0 +1,16 @@
+"""gym_mara: Gymnasium environments for the modular robot arm MARA. Importing it registers them."""
+
+from gymnasium.envs.registration import register
+
+from gym_mara.tasks import TASKS
+
+__version__ = "0.1.0"
+
+for _name in TASKS:
+    register(
+        id=f"gym_mara/{_name}",
+        entry_point="gym_mara.envs:MaraEnv",
+        vector_entry_point="gym_mara.envs:MaraVectorEnv",
+        kwargs={"task": _name},
+        max_episode_steps=2048,
+    )

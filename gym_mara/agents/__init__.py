@@ -1,0 +1,1 @@
+"""Training and evaluating agents; everything here needs the extra `train`."""

@@ -1,0 +1,103 @@
+"""Evaluating a policy: how near it brings the tool, over whole episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from gym_mara.agents.policy import load_policy
+from gym_mara.agents.run import RunFolder
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.envs import MaraVectorEnv
+from gym_mara.errors import GymMaraError
+
+METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
+
+
+def make_env(
+    task: str, backend: str, num_envs: int, options: dict[str, Any], max_episode_steps: int = 2048
+) -> MaraVecEnv:
+    """N arms of a task for Stable-Baselines3."""
+    env = MaraVectorEnv(
+        num_envs,
+        task,
+        backend=backend,
+        autoreset_mode="SameStep",
+        max_episode_steps=max_episode_steps,
+        **options,
+    )
+    return MaraVecEnv(env)
+
+
+def evaluate_run(
+    run: RunFolder, *, backend: str | None = None, episodes: int = 10, which: str = "last"
+) -> dict[str, NDArray[np.float64]]:
+    """Play episodes with a run's deterministic policy.
+
+    Args:
+        run: the run.
+        backend: the backend to play on; by default the one it was trained on.
+        episodes: how many.
+        which: the policy, "last" or "best".
+
+    Returns:
+        Each of METRICS per episode (episodes,): position and angle at the last step.
+
+    Raises:
+        GymMaraError: the policy is missing, damaged, or of another environment; episodes is below 1.
+    """
+    if episodes < 1:
+        raise GymMaraError(f"episodes must be at least 1, not {episodes}")
+    config = run.config
+    env = make_env(config.env, backend or config.backend, episodes, config.env_options)
+    try:
+        return evaluate_policy_folder(run.policy(which), config.algo, env, config.seed)
+    finally:
+        env.close()
+
+
+def evaluate_policy_folder(
+    folder: Path, algo: str, env: MaraVecEnv, seed: int
+) -> dict[str, NDArray[np.float64]]:
+    """Play one episode per arm of `env` with the policy in a folder."""
+    model, wrapped = load_policy(folder, algo, env, training=False)
+    env.seed(seed)
+    return play(model, wrapped)
+
+
+def play(model: BaseAlgorithm, env: VecNormalize) -> dict[str, NDArray[np.float64]]:
+    """Play one episode per arm with the deterministic policy; METRICS, each (N,)."""
+    results: list[dict[str, Any] | None] = [None] * env.num_envs
+    observation: Any = env.reset()
+    while any(result is None for result in results):
+        action, _ = model.predict(observation, deterministic=True)
+        observation, _, done, infos = env.step(action)
+        for index in np.flatnonzero(done):
+            results[index] = results[index] or infos[index]
+    finished = [result for result in results if result is not None]
+    columns = (
+        [1000.0 * r["position_error"] for r in finished],
+        [np.degrees(r["angle_error"]) for r in finished],
+        [r["ep_rew_mean"] for r in finished],
+        [r["episode"]["r"] for r in finished],
+        [r["num_coll"] for r in finished],
+    )
+    return {name: np.array(column, float) for name, column in zip(METRICS, columns, strict=True)}
+
+
+def spread(metrics: dict[str, NDArray[np.float64]]) -> dict[str, dict[str, float]]:
+    """Mean, standard deviation, least and largest of each metric over the episodes."""
+    return {
+        name: {
+            "mean": float(values.mean()),
+            "std": float(values.std()),
+            "min": float(values.min()),
+            "max": float(values.max()),
+        }
+        for name, values in metrics.items()
+    }

@@ -1,0 +1,122 @@
+"""Stable-Baselines3's view of a MaraVectorEnv: a native VecEnv, without one Python object per arm."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from gym_mara.envs import MaraVectorEnv
+from gym_mara.errors import GymMaraError
+
+
+class MaraVecEnv(VecEnv):
+    """N arms for Stable-Baselines3, their actions rescaled so that [-1, 1] spans each joint's range.
+
+    The info of an arm is empty but at the end of its episode, where it holds `terminal_observation`,
+    `TimeLimit.truncated`, Monitor's `episode`, and what MaraEnv reports at a last step.
+
+    Args:
+        env: the environment, which must reset in the same step.
+
+    Raises:
+        GymMaraError: the environment's autoreset mode is another.
+    """
+
+    def __init__(self, env: MaraVectorEnv) -> None:
+        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise GymMaraError(
+                "Stable-Baselines3 wants episodes reset in the same step: autoreset_mode='SameStep'"
+            )
+        self.env = env
+        shape = (env.simulation.robot.num_joints,)
+        super().__init__(
+            env.num_envs, env.single_observation_space, Box(-1.0, 1.0, shape, np.float32)
+        )
+        self._low, self._high = env.simulation.target_low, env.simulation.target_high
+        self._actions: NDArray[np.float32] = np.zeros((env.num_envs, *shape), np.float32)
+        self._returns = np.zeros(env.num_envs)
+        self._start = time.time()
+        self.reward_sum = 0.0
+        """The sum of all rewards since it was last set to zero."""
+
+    def reset(self) -> NDArray[np.float64]:
+        seeds, self._returns = self._seeds, np.zeros(self.num_envs)
+        observation, _ = self.env.reset(seed=seeds if seeds[0] is not None else None)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observation
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        span = 0.5 * (self._high - self._low)
+        targets = self._low + span * (np.asarray(self._actions, np.float64) + 1.0)
+        observation, reward, terminated, truncated, info = self.env.step(targets)
+        self._returns += reward
+        self.reward_sum += float(reward.sum())
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(done).tolist():
+            infos[index] = self._final_info(index, info)
+            infos[index]["TimeLimit.truncated"] = bool(truncated[index] and not terminated[index])
+            self._returns[index] = 0.0
+        return observation, reward.astype(np.float32), done, infos
+
+    def _final_info(self, index: int, info: dict[str, Any]) -> dict[str, Any]:
+        final = info["final_info"]
+        statistics = _at(final["statistics"], index)
+        steps = int(statistics["ep_steps"])
+        return {
+            **_at({k: v for k, v in final.items() if k != "statistics"}, index),
+            **statistics,
+            "terminal_observation": info["final_obs"][index],
+            "episode": {
+                "r": float(self._returns[index]),
+                "l": steps,
+                "t": round(time.time() - self._start, 6),
+            },
+        }
+
+    def save_state(self) -> dict[str, Any]:
+        """A snapshot of the environment and of the running returns."""
+        return {"env": self.env.save_state(), "returns": self._returns.copy()}
+
+    def restore_state(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot."""
+        self.env.restore_state(snapshot["env"])
+        self._returns = snapshot["returns"].copy()
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        setattr(self.env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        chosen: Sequence[int] | Iterable[int] = self._get_indices(indices)
+        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
+        return [result for _ in chosen]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+def _at(values: dict[str, Any], index: int) -> dict[str, Any]:
+    """One arm's part of a batch of infos, as plain numbers."""
+    return {k: v[index].item() for k, v in values.items() if not k.startswith("_")}

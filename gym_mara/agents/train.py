@@ -1,0 +1,133 @@
+"""Training an agent: from a configuration to a finished run folder, or on from where a run was cut off."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+)
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
+
+from gym_mara.agents import presets
+from gym_mara.agents.callbacks import Keeper, Report, base_env, restore_random_state
+from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.plot import plot_learning_curve
+from gym_mara.agents.policy import algorithm_class, load_policy
+from gym_mara.agents.run import RunConfig, RunFolder, read_progress
+from gym_mara.errors import GymMaraError
+
+CHECKPOINT_EVERY = 50_000
+
+
+def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
+    """Train an agent into a new run folder.
+
+    Raises:
+        GymMaraError: a name is unknown, a value out of range, or the folder exists.
+    """
+    if config.steps < 1:
+        raise GymMaraError(f"steps must be at least 1, not {config.steps}")
+    preset = presets.preset(config.algo, config.env)
+    config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
+    model = new_model(config)  # before the folder: what cannot be built leaves none behind
+    run = RunFolder.create(out, config)
+    return _learn(run, model, best=-np.inf, report=report)
+
+
+def resume(path: Path, report: Report) -> RunFolder:
+    """Go on with a run from its last checkpoint, as if it had never been cut off.
+
+    Raises:
+        GymMaraError: it is no run folder, it is damaged, or it has finished.
+    """
+    run = RunFolder.open(path)
+    config = run.config
+    checkpoints = run.checkpoints()
+    if not checkpoints:
+        return _learn(run, new_model(config), best=-np.inf, report=report)
+    preset = presets.Preset(**config.preset)
+    env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
+    model, _ = load_policy(checkpoints[-1], config.algo, env, training=True)
+    if model.num_timesteps >= config.steps:
+        raise GymMaraError(f"the run {str(path)!r} has finished its {config.steps} steps")
+    try:
+        state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
+        env.restore_state(state["env"])
+        restore_random_state(state["random"])
+    except (OSError, EOFError, pickle.UnpicklingError, KeyError) as error:
+        raise GymMaraError(
+            f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
+        ) from error
+    return _learn(run, model, best=state["best"], report=report)
+
+
+def new_model(config: RunConfig) -> OnPolicyAlgorithm:
+    """An untrained agent, with its environment, as a configuration asks for it."""
+    # The networks are small: a second thread costs more than it brings.
+    torch.set_num_threads(1)
+    preset = presets.Preset(**config.preset)
+    env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
+    wrapped = VecNormalize(
+        env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
+    )
+    arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
+    return algorithm_class(config.algo)(
+        "MlpPolicy", wrapped, seed=config.seed, device="cpu", **arguments
+    )
+
+
+def _schedule(value: Any) -> Any:
+    """A preset's value as the algorithm wants it."""
+    if isinstance(value, (tuple, list)) and value and value[0] == "linear":
+        return LinearSchedule(*value[1:])
+    return value
+
+
+class LinearSchedule:
+    """From `start` at the first step to `end` at the last; a class, as a model on disk needs it."""
+
+    def __init__(self, start: float, end: float) -> None:
+        self.start, self.end = start, end
+
+    def __call__(self, progress_remaining: float) -> float:
+        return self.end + (self.start - self.end) * progress_remaining
+
+
+def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
+    torch.set_num_threads(1)
+    model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
+    keeper = Keeper(run, CHECKPOINT_EVERY, best, report)
+    report(model.num_timesteps, {})
+    model.learn(
+        run.config.steps - model.num_timesteps,
+        callback=keeper,
+        reset_num_timesteps=False,
+        log_interval=1,
+    )
+    model.logger.close()
+    base_env(model).close()
+    plot_learning_curve(run)
+    return run
+
+
+def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
+    """The table and the TensorBoard log, without what a run that was cut off wrote after its last checkpoint."""
+    rows = read_progress(run.progress_file) if run.progress_file.is_file() else []
+    table = CSVOutputFormat(str(run.progress_file))
+    for row in rows:
+        if row["time/total_timesteps"] <= steps:
+            table.write(dict(row), {})
+    if steps == 0:
+        shutil.rmtree(run.path / "tensorboard", ignore_errors=True)
+    return [table, TensorBoardOutputFormat(str(run.path / "tensorboard"))]

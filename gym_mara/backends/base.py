@@ -1,0 +1,57 @@
+"""The contract of a backend: it moves N arms, a control period at a time, and reports their state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.state import SimState
+
+Floats = NDArray[np.float64]
+
+
+class Backend(ABC):
+    """N independent arms of one robot in one engine.
+
+    A subclass adds its engine's settings as keyword arguments of plain types. Inputs come checked: q and q_target are
+    finite, of shape (N, J) and within the joint limits. What `state` returns is never changed afterwards.
+    A backend pickles and deep-copies with its state.
+    """
+
+    def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
+        if not (np.isfinite(control_period) and control_period > 0):
+            raise GymMaraError(f"control_period must be positive (s), not {control_period!r}")
+        self.robot = robot
+        self.num_envs = num_envs
+        self.control_period = float(control_period)
+        self.joint_velocity = robot.velocity_limit
+        """How fast the joints are at most in this backend (J,), rad/s."""
+
+    @abstractmethod
+    def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
+        """Put the arms, or those that the mask (N,) names, at rest at q (N, J), rad, with their time at zero."""
+
+    @abstractmethod
+    def step(self, q_target: Floats) -> SimState:
+        """Move all arms towards q_target (N, J), rad, for one control period, and return their state then."""
+
+    @property
+    @abstractmethod
+    def state(self) -> SimState:
+        """The state now; right after a reset `collided` tells whether links touch at q."""
+
+    @abstractmethod
+    def save(self) -> dict[str, Any]:
+        """A snapshot of the simulation, from which it goes on identically; it pickles."""
+
+    @abstractmethod
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot of a backend of the same robot, size and settings."""
+
+    def close(self) -> None:  # noqa: B027 - most have nothing to free
+        """Free the engine; nothing else is called afterwards."""

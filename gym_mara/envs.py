@@ -1,0 +1,244 @@
+"""The environments: MaraEnv for one arm, MaraVectorEnv for many at once."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.robot import RobotModel
+from gym_mara.simulation import Mask, Simulation
+from gym_mara.tasks import Task
+
+Floats = NDArray[np.float64]
+
+
+class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
+    """One arm.
+
+    The observation is the task's, (O,); the action holds absolute joint targets (J,), rad. `info` carries the terms of
+    the reward and `collided`, and at the end of an episode `statistics`.
+
+    Args:
+        task: the name of a task, such as "MARA-v0", or a Task.
+        robot: a robot's name, the path of a URDF, or a RobotModel.
+        ee_frame: the end-effector link of a URDF of your own.
+        backend: the name of a backend.
+        render_mode: None, the only one so far.
+        **options: values of the task (`target_position`, `on_collision`, …) and settings of the backend
+            (`max_joint_velocity`, …).
+
+    Raises:
+        GymMaraError: a name is unknown, or a value is out of its range.
+        MissingExtraError: a library is not installed.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
+
+    def __init__(
+        self,
+        task: str | Task = "MARA-v0",
+        *,
+        robot: str | RobotModel = "mara",
+        ee_frame: str | None = None,
+        backend: str = "pinocchio",
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        _check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.simulation = Simulation(task, 1, robot, ee_frame, backend, options)
+        self.observation_space = self.simulation.observation_space  # type: ignore[assignment]
+        self.action_space = self.simulation.action_space
+        self.metadata = self.metadata | {"render_fps": 1.0 / self.simulation.backend.control_period}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode at the start pose; `options` has no meaning yet."""
+        super().reset(seed=seed)
+        return self.simulation.reset()[0], {}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Move towards the joint targets (J,), rad, for one control period.
+
+        Raises:
+            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
+        """
+        outcome = self.simulation.step(np.asarray(action)[None])
+        info = {name: values[0].item() for name, values in outcome.info.items()}
+        terminated = bool(outcome.terminated[0])
+        if terminated or self.simulation.statistics.steps[0] == self._max_episode_steps():
+            summary = self.simulation.statistics.summary()
+            info["statistics"] = {name: values[0].item() for name, values in summary.items()}
+        return outcome.observation[0], outcome.reward[0].item(), terminated, False, info
+
+    def _max_episode_steps(self) -> int | None:
+        """When Gymnasium's TimeLimit, which `gymnasium.make` wraps around, ends the episode."""
+        return self.spec.max_episode_steps if self.spec else None
+
+    def save_state(self) -> dict[str, Any]:
+        """A snapshot of the arm, the episode and the random generator; it pickles."""
+        return self.simulation.save() | {"np_random": copy.deepcopy(self.np_random)}
+
+    def restore_state(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot of an environment made alike."""
+        self.simulation.restore(snapshot)
+        self.np_random = copy.deepcopy(snapshot["np_random"])
+
+    def close(self) -> None:
+        """Free the backend."""
+        self.simulation.close()
+
+
+class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
+    """N arms in one batch: the numbers of N MaraEnvs, at a fraction of the time.
+
+    Args:
+        num_envs: N.
+        task, robot, ee_frame, backend, render_mode, **options: as in MaraEnv.
+        max_episode_steps: the length of an episode, after which it is truncated; None for no end.
+        autoreset_mode: Gymnasium's: "NextStep", "SameStep" or "Disabled".
+
+    Raises:
+        GymMaraError: a name is unknown, or a value is out of its range.
+        MissingExtraError: a library is not installed.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str | Task = "MARA-v0",
+        *,
+        robot: str | RobotModel = "mara",
+        ee_frame: str | None = None,
+        backend: str = "pinocchio",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = 2048,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **options: Any,
+    ) -> None:
+        _check_render_mode(render_mode)
+        self.render_mode = render_mode
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise GymMaraError(f"max_episode_steps must be at least 1, not {max_episode_steps!r}")
+        self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options)
+        self.num_envs = self.simulation.num_envs
+        self.single_observation_space = self.simulation.observation_space
+        self.single_action_space = self.simulation.action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.max_episode_steps = max_episode_steps
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {
+            "render_modes": [],
+            "render_fps": 1.0 / self.simulation.backend.control_period,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin episodes, of all arms or of those that `options["reset_mask"]`, bool (N,), names."""
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            if len(seed) != self.num_envs:
+                raise GymMaraError(f"{len(seed)} seeds for {self.num_envs} environments")
+            seed = seed[0]
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask")
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+                raise GymMaraError(
+                    f"reset_mask must be bool, of shape {(self.num_envs,)}, and choose at least one"
+                )
+        self._ended[slice(None) if mask is None else mask] = False
+        return self.simulation.reset(mask), {}
+
+    def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
+        """Move every arm towards its joint targets (N, J), rad, for one control period.
+
+        Raises:
+            GymMaraError: the actions have the wrong shape or are not finite; no arm has moved then.
+        """
+        resetting = self._ended.copy()
+        if resetting.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise GymMaraError(
+                "episodes have ended: reset them, reset(options={'reset_mask': …}), before the next step"
+            )
+        outcome = self.simulation.step(actions)
+        observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
+        truncated = self.simulation.statistics.steps == self.max_episode_steps
+        if resetting.any():  # NEXT_STEP: these began an episode instead of stepping
+            observation[resetting] = self.simulation.reset(resetting)[resetting]
+            reward[resetting] = 0.0
+            terminated, truncated = terminated & ~resetting, truncated & ~resetting
+        ended = terminated | truncated
+        info = _vector_info(outcome.info, ~resetting)
+        if ended.any():
+            info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                final = np.full(self.num_envs, None, dtype=object)
+                for index in np.flatnonzero(ended):
+                    final[index] = observation[index].copy()
+                final_info = {"final_info": {k: v for k, v in info.items() if k[0] != "_"}}
+                info = _vector_info(outcome.info, ~ended)
+                info |= {"final_obs": final, "_final_obs": ended.copy()}
+                info |= _vector_info(final_info, ended)
+                observation[ended] = self.simulation.reset(ended)[ended]
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._ended = ended.copy()
+        return observation, reward, terminated, truncated, info
+
+    def save_state(self) -> dict[str, Any]:
+        """A snapshot of the arms, the episodes and the random generator; it pickles."""
+        return self.simulation.save() | {
+            "ended": self._ended.copy(),
+            "np_random": copy.deepcopy(self.np_random),
+        }
+
+    def restore_state(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot of an environment made alike."""
+        self.simulation.restore(snapshot)
+        self._ended = snapshot["ended"].copy()
+        self.np_random = copy.deepcopy(snapshot["np_random"])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the backend; called by close()."""
+        self.simulation.close()
+
+
+def _check_render_mode(render_mode: str | None) -> None:
+    if render_mode is not None:
+        raise GymMaraError(f"render_mode {render_mode!r} is not supported yet; use None")
+
+
+def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        raise unknown("autoreset_mode", mode, [m.value for m in AutoresetMode]) from None
+
+
+def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
+    """Gymnasium's form of a batch of infos: a mask `_key` beside each key says which arms it speaks of."""
+    info: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            nested = {k: v for k, v in value.items() if not k.startswith("_")}
+            info[key] = _vector_info(nested, mask)
+        else:
+            info[key] = np.where(mask, value, np.zeros((), dtype=value.dtype))
+        info[f"_{key}"] = mask.copy()
+    return info

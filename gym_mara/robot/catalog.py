@@ -1,0 +1,75 @@
+"""The robots known by name, and where their files lie."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import pinocchio
+
+from gym_mara.errors import MissingExtraError, unknown
+
+
+class RobotFiles(NamedTuple):
+    """A robot's URDF, its SRDF if it has one, and its end-effector frame if the SRDF does not name it."""
+
+    urdf: Path
+    srdf: Path | None = None
+    ee_frame: str | None = None
+
+
+def _robots_dir() -> Path:
+    return Path(str(resources.files("gym_mara.robots")))
+
+
+def own_robots() -> dict[str, RobotFiles]:
+    """The robots that gym_mara ships: a folder each, with NAME.urdf and NAME.srdf in it."""
+    return {
+        urdf.stem: RobotFiles(urdf, urdf.with_suffix(".srdf"))
+        for urdf in sorted(_robots_dir().glob("*/*.urdf"))
+        if urdf.stem == urdf.parent.name
+    }
+
+
+def example_robots_dir() -> Path | None:
+    """The folder of example-robot-data's robots, or None where it is not installed."""
+    for parent in Path(pinocchio.__file__).resolve().parents:
+        folder = parent / "share" / "example-robot-data" / "robots"
+        if folder.is_dir():
+            return folder
+    return None
+
+
+def _example_arms() -> dict[str, dict[str, str | None]]:
+    """The fixed-base arms of example-robot-data, their files named below its folder of robots."""
+    arms: dict[str, dict[str, str | None]] = json.loads(
+        (_robots_dir() / "example_arms.json").read_text()
+    )
+    return arms
+
+
+def robot_names() -> list[str]:
+    """Every name that `find` knows; the robots that gym_mara ships come first."""
+    return [*own_robots(), *_example_arms()]
+
+
+def find(name: str) -> RobotFiles:
+    """The files of the robot of this name.
+
+    Raises:
+        GymMaraError: no robot has this name.
+        MissingExtraError: it is one of example-robot-data's, which is not installed.
+    """
+    own = own_robots()
+    if name in own:
+        return own[name]
+    arm = _example_arms().get(name)
+    if arm is None:
+        raise unknown("robot", name, robot_names())
+    folder = example_robots_dir()
+    if folder is None:
+        raise MissingExtraError(f"robot {name!r}", "example-robot-data", "robots")
+    srdf = arm["srdf"]
+    return RobotFiles(folder / str(arm["urdf"]), folder / srdf if srdf else None, arm["ee_frame"])

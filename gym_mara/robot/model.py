@@ -1,0 +1,327 @@
+"""RobotModel: what an arm is, read once from its URDF and SRDF."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import catalog
+from gym_mara.robot.kinematics import Kinematics
+from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotModel:
+    """A fixed-base arm: the chain of joints from the world to its end-effector frame, and all that hangs on it.
+
+    Joints off the chain (a gripper's fingers) are locked. Arrays are read-only, (J,), in the order of the chain.
+    """
+
+    name: str
+    urdf: Path
+    srdf: Path | None
+    ee_frame: str
+    joint_names: tuple[str, ...]
+    lower: Floats
+    """Lower position limits, rad (m for a prismatic joint)."""
+    upper: Floats
+    velocity_limit: Floats
+    """rad/s (m/s)."""
+    effort_limit: Floats
+    """Nm (N)."""
+    home: Floats
+    """The start pose: the SRDF's first that names every joint, else zeros, within the limits."""
+    collision_pairs: frozenset[frozenset[str]]
+    """The pairs of links that may collide."""
+    model: pin.Model
+    """Pinocchio's model, its joints those of `joint_names`."""
+    geometry: pin.GeometryModel
+    """Pinocchio's collision geometry, with its collision pairs set."""
+
+    @classmethod
+    def load(cls, robot: str | Path | RobotModel, ee_frame: str | None = None) -> RobotModel:
+        """The robot of a name ("mara", "ur5", …), of a path to a URDF, or itself.
+
+        Raises:
+            GymMaraError: the name is unknown, or the URDF is not one of a fixed-base arm.
+            MissingExtraError: the robot's files come with a package that is not installed.
+        """
+        if isinstance(robot, RobotModel):
+            return robot
+        if isinstance(robot, Path) or robot.endswith((".urdf", ".xml")):
+            path = Path(robot).absolute()
+            srdf = path.with_suffix(".srdf")
+            return cls.from_urdf(path, ee_frame, srdf if srdf.is_file() else None)
+        files = catalog.find(robot)
+        return cls.from_urdf(files.urdf, ee_frame or files.ee_frame, files.srdf, name=robot)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: Path | str,
+        ee_frame: str | None = None,
+        srdf: Path | str | None = None,
+        *,
+        name: str | None = None,
+    ) -> RobotModel:
+        """Load an arm from files of your own.
+
+        Meshes are looked for beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
+        Without an SRDF that disables pairs, links joined by one joint and links that touch at home do not collide.
+
+        Args:
+            urdf: path of the URDF file.
+            ee_frame: the end-effector link; by default the one that the SRDF names.
+            srdf: path of the SRDF file: disabled collisions, home pose, end effector.
+            name: what the robot is called; by default as in the URDF.
+
+        Raises:
+            GymMaraError: a file is missing or broken, the frame does not exist or no fixed-base chain leads to it.
+        """
+        urdf, srdf = Path(urdf), None if srdf is None else Path(srdf)
+        root = read_xml(urdf, "URDF")
+        semantics = read_srdf(srdf) if srdf else Semantics()
+        ee_frame = _checked_ee_frame(urdf, root, ee_frame or semantics.end_effector)
+        chain = _to_chain(urdf, root, ee_frame)
+        model, geometry = _build(urdf, ElementTree.tostring(root, encoding="unicode"))
+        home = _home(semantics, chain, model)
+        robot = cls(
+            name=name or root.get("name") or urdf.stem,
+            urdf=urdf,
+            srdf=srdf,
+            ee_frame=ee_frame,
+            joint_names=tuple(model.names)[1:],
+            lower=_read_only(model.lowerPositionLimit),
+            upper=_read_only(model.upperPositionLimit),
+            velocity_limit=_read_only(model.velocityLimit),
+            effort_limit=_read_only(model.effortLimit),
+            home=_read_only(home),
+            collision_pairs=_set_collision_pairs(root, semantics, model, geometry, home),
+            model=model,
+            geometry=geometry,
+        )
+        return robot
+
+    @property
+    def num_joints(self) -> int:
+        """J, the number of joints of the chain."""
+        return len(self.joint_names)
+
+    @property
+    def ee_frame_id(self) -> int:
+        """Pinocchio's number of the end-effector frame; a joint may bear the same name."""
+        return int(self.model.getFrameId(self.ee_frame, pin.FrameType.BODY))
+
+    def kinematics(self) -> Kinematics:
+        """Forward kinematics of many configurations at once, with a work space of its own."""
+        return Kinematics.of(self.model, self.ee_frame_id)
+
+    @cached_property
+    def reach(self) -> Floats:
+        """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or 1 if prismatic."""
+        reach = np.zeros(self.num_joints)
+        for body, point in self._points():
+            for joint in range(body):
+                reach[joint] = max(reach[joint], self._lengths[joint + 1 : body].sum() + point)
+        reach[self.kinematics().prismatic] = 1.0
+        return _read_only(reach)
+
+    @cached_property
+    def extent(self) -> float:
+        """A bound on how far any point of the arm can be from the world's origin, m."""
+        return max(float(self._lengths[:body].sum() + point) for body, point in self._points())
+
+    @cached_property
+    def _lengths(self) -> Floats:
+        """How far at most each joint's origin can be from the joint's before (J,), m; the first from the world's."""
+        slides = self.kinematics().prismatic
+        span = np.where(slides, np.maximum(abs(self.lower), abs(self.upper)), 0.0)
+        return span + [np.linalg.norm(p.translation) for p in self.model.jointPlacements[1:]]
+
+    def _points(self) -> list[tuple[int, float]]:
+        """How far the points of the arm are at most from the joint that carries them: joint number, m."""
+        frame = self.model.frames[self.ee_frame_id]
+        points = [(int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)))]
+        for geometry_object in self.geometry.geometryObjects:
+            shape, body = geometry_object.geometry, geometry_object.parentJoint
+            if body > 0:
+                shape.computeLocalAABB()
+                centre = geometry_object.placement.act(shape.aabb_center)
+                points.append((body, float(np.linalg.norm(centre) + shape.aabb_radius)))
+        return points
+
+    def link_of(self, geometry_index: int) -> str:
+        """The name of the link that a collision geometry belongs to."""
+        return _link_of(self.model, self.geometry.geometryObjects[geometry_index])
+
+    def checked_q(self, q: Sequence[float] | Floats, what: str) -> Floats:
+        """A configuration (J,) of this robot within its limits, as a fresh array.
+
+        Raises:
+            GymMaraError: it has another length, is not finite or is beyond a joint's limits.
+        """
+        array = np.array(q, dtype=np.float64)
+        if array.shape != (self.num_joints,):
+            raise GymMaraError(
+                f"{what} has shape {array.shape}; {self.name} wants {(self.num_joints,)}"
+            )
+        beyond = ~((array >= self.lower) & (array <= self.upper))
+        if beyond.any():
+            joint = int(beyond.argmax())
+            raise GymMaraError(
+                f"{what}: joint {self.joint_names[joint]} cannot be at {array[joint]}; "
+                f"its limits are [{self.lower[joint]}, {self.upper[joint]}]"
+            )
+        return array
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Pinocchio's geometry does not pickle; the files say it all.
+        return _reload, (self.urdf, self.ee_frame, self.srdf, self.name)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
+        return self  # immutable
+
+    def __repr__(self) -> str:
+        return f"RobotModel({self.name!r}, joints={list(self.joint_names)}, ee_frame={self.ee_frame!r})"
+
+
+def _reload(urdf: Path, ee_frame: str, srdf: Path | None, name: str) -> RobotModel:
+    return RobotModel.from_urdf(urdf, ee_frame, srdf, name=name)
+
+
+def _read_only(values: Floats) -> Floats:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+def _checked_ee_frame(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
+    links = [link.get("name", "") for link in root.iter("link")]
+    if ee_frame is None:
+        raise GymMaraError(
+            f"name the end-effector link of {str(urdf)!r} (ee_frame=…), one of: {', '.join(links)}"
+        )
+    if ee_frame not in links:
+        raise GymMaraError(
+            f"{str(urdf)!r} has no link {ee_frame!r} to be the end-effector frame; it has: {', '.join(links)}"
+        )
+    return ee_frame
+
+
+def _to_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str]:
+    """Make the URDF one chain of single-position joints to the end-effector frame, and return their names.
+
+    Joints off the chain become fixed; continuous joints turn between -π and π.
+    """
+    joints = {}
+    for joint in root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is None or child is None:
+            raise GymMaraError(
+                f"{str(urdf)!r}: joint {joint.get('name')!r} lacks a parent or child"
+            )
+        joints[child.get("link")] = (joint, parent.get("link"))
+    chain: list[str] = []
+    link: str | None = ee_frame
+    while link in joints:
+        joint, link = joints.pop(link)
+        kind = "mimic" if joint.find("mimic") is not None else joint.get("type")
+        if kind == "continuous":
+            _make_revolute(joint)
+        elif kind not in ("revolute", "prismatic", "fixed"):
+            raise GymMaraError(
+                f"{str(urdf)!r} is not a fixed-base chain to {ee_frame!r}: joint {joint.get('name')!r} "
+                f"is {kind}; only revolute, continuous, prismatic and fixed joints may lead there"
+            )
+        if kind != "fixed":
+            chain.insert(0, joint.get("name", ""))
+    if not chain:
+        raise GymMaraError(f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; it is no arm")
+    for joint, _ in joints.values():
+        joint.set("type", "fixed")
+    return chain
+
+
+def _make_revolute(joint: ElementTree.Element) -> None:
+    joint.set("type", "revolute")
+    limit = joint.find("limit")
+    if limit is None:
+        limit = ElementTree.SubElement(joint, "limit", effort="inf", velocity="inf")
+    limit.set("lower", repr(-np.pi))
+    limit.set("upper", repr(np.pi))
+
+
+def _build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
+    """Pinocchio's model of a URDF's text and its collision geometry."""
+    # Catalogues name meshes package://…; a package may be any folder above the URDF.
+    ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
+    folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
+    try:
+        model = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(
+            model, text, pin.GeometryType.COLLISION, package_dirs=folders
+        )
+    except (ValueError, RuntimeError) as error:
+        raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {error}") from error
+    return model, geometry
+
+
+def _home(semantics: Semantics, chain: list[str], model: pin.Model) -> Floats:
+    named = (s for s in semantics.group_states if all(joint in s for joint in chain))
+    pose = next(named, dict.fromkeys(chain, 0.0))
+    return np.clip([pose[j] for j in chain], model.lowerPositionLimit, model.upperPositionLimit)
+
+
+def _link_of(model: pin.Model, geometry_object: pin.GeometryObject) -> str:
+    return str(model.frames[geometry_object.parentFrame].name)
+
+
+def _set_collision_pairs(
+    root: ElementTree.Element,
+    semantics: Semantics,
+    model: pin.Model,
+    geometry: pin.GeometryModel,
+    home: Floats,
+) -> frozenset[frozenset[str]]:
+    """Give the geometry its collision pairs, and return them as pairs of links."""
+    never = set(semantics.disabled_pairs)
+    for joint in root.findall("joint"):
+        ends = joint.find("parent"), joint.find("child")
+        never.add(frozenset(end.get("link", "") for end in ends if end is not None))
+
+    def set_pairs() -> None:
+        objects = list(enumerate(geometry.geometryObjects))
+        geometry.removeAllCollisionPairs()
+        for i, a in objects:
+            for j, b in objects[i + 1 :]:
+                links = frozenset((_link_of(model, a), _link_of(model, b)))
+                if a.parentJoint != b.parentJoint and links not in never:
+                    geometry.addCollisionPair(pin.CollisionPair(i, j))
+
+    def links_of_pairs() -> list[frozenset[str]]:
+        objects = geometry.geometryObjects
+        return [
+            frozenset((_link_of(model, objects[p.first]), _link_of(model, objects[p.second])))
+            for p in geometry.collisionPairs
+        ]
+
+    set_pairs()
+    if not semantics.disabled_pairs and len(geometry.collisionPairs):
+        data = geometry.createData()
+        pin.computeCollisions(model, model.createData(), geometry, data, home, False)
+        touching = [result.isCollision() for result in data.collisionResults]
+        never.update(p for p, hit in zip(links_of_pairs(), touching, strict=True) if hit)
+        set_pairs()
+    return frozenset(links_of_pairs())

@@ -1,0 +1,85 @@
+"""Which poses an arm can reach: how far off a pose is, and one that is certainly within reach."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from gym_mara.robot.collision import make_checker
+from gym_mara.robot.model import RobotModel
+
+Floats = NDArray[np.float64]
+
+
+def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
+    """The configuration (J,), rad, within the limits, that comes closest to a pose; collisions do not count.
+
+    Damped least squares (Nakamura and Hanafusa 1986) from the home pose and from fixed random configurations.
+
+    Args:
+        robot: the arm.
+        position: of the end-effector frame in the world (3,), m.
+        quaternion: its orientation [w, x, y, z]; None where any will do.
+    """
+    w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
+    target = pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.asarray(position))
+    rng = np.random.default_rng(0)
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    data = robot.model.createData()
+    rows = slice(0, 3 if quaternion is None else 6)
+
+    def error(q: Floats) -> Floats:
+        pin.forwardKinematics(robot.model, data, q)
+        here = pin.updateFramePlacement(robot.model, data, robot.ee_frame_id)
+        turn = pin.log3(target.rotation @ here.rotation.T)
+        return np.concatenate([target.translation - here.translation, turn])[rows]
+
+    best, best_error = robot.home.copy(), np.inf
+    for start in [robot.home, *rng.uniform(low, high, (20, robot.num_joints))]:
+        q = np.array(start)
+        for _ in range(100):
+            off = error(q)
+            if np.linalg.norm(off) < best_error:
+                best, best_error = q.copy(), float(np.linalg.norm(off))
+            if best_error < 1e-9:
+                return best
+            jacobian = pin.computeFrameJacobian(
+                robot.model, data, q, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
+            )[rows]
+            damped = jacobian @ jacobian.T + 1e-4 * (off @ off + 1e-6) * np.eye(len(off))
+            q = np.clip(q + jacobian.T @ np.linalg.solve(damped, off), robot.lower, robot.upper)
+    return best
+
+
+def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
+    """How near the arm can come to a pose: the distance, m, and the angle, rad (0 where any orientation will do)."""
+    q = solve_ik(robot, position, quaternion)
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    here = pin.updateFramePlacement(robot.model, data, robot.ee_frame_id)
+    distance = float(np.linalg.norm(here.translation - position))
+    if quaternion is None:
+        return distance, 0.0
+    w, x, y, z = quaternion
+    turn = pin.Quaternion(w, x, y, z).normalized().matrix() @ here.rotation.T
+    return distance, float(np.linalg.norm(pin.log3(turn)))
+
+
+def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
+    """The end-effector pose, position (3,) m and quaternion (4,), of a collision-free configuration.
+
+    Always the same for a robot: the first of a fixed sequence, in the middle of the joints' ranges, that moves the
+    tool away from home.
+    """
+    checker = make_checker("coal", robot)
+    kinematics = robot.kinematics()
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    rng = np.random.default_rng(0)
+    candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
+    candidates = np.vstack([candidates, robot.home])  # where all else collides
+    position, quaternion = kinematics.pose(kinematics.frames(candidates))
+    away = np.linalg.norm(position - position[-1], axis=1)
+    good = ~checker.check(candidates) & (away > 0.25 * away.max())
+    chosen = int(good.argmax()) if good.any() else len(candidates) - 1
+    return position[chosen], quaternion[chosen]

@@ -1,0 +1,78 @@
+"""Unit quaternions [w, x, y, z] in NumPy, batched over leading axes.
+
+Everything here is a fixed sequence of operations per row, so that a row's result does not depend on the batch it is in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# b in a ⊗ b as a matrix acting on a: entry (i, j) is sign[i, j] * b[index[i, j]].
+_RIGHT_INDEX = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_RIGHT_SIGN = np.array(
+    [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]]
+)
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def multiply(a: Floats, b: Floats) -> Floats:
+    """The Hamilton product a ⊗ b of quaternions (..., 4)."""
+    matrix = b[..., _RIGHT_INDEX] * _RIGHT_SIGN
+    return (matrix @ a[..., None])[..., 0]
+
+
+def conjugate(q: Floats) -> Floats:
+    """The conjugate, which for unit quaternions (..., 4) is the inverse rotation."""
+    return q * _CONJUGATE
+
+
+def canonical(q: Floats) -> Floats:
+    """Of the two quaternions (..., 4) of a rotation the one with w >= 0."""
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def angle_between(a: Floats, b: Floats) -> Floats:
+    """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, w the real part of a ⊗ conj(b)."""
+    w = np.abs((a * b).sum(axis=-1))
+    return 2.0 * np.arccos(np.minimum(w, 1.0))
+
+
+def normalised(q: Floats) -> Floats:
+    """Quaternions (..., 4) scaled to unit length."""
+    return q / np.sqrt((q * q).sum(axis=-1, keepdims=True))
+
+
+def _outer_product_map() -> tuple[Floats, Floats]:
+    """The affine map from a flattened rotation matrix (9,) to the flattened 4 q qᵀ (16,)."""
+    linear, constant = np.zeros((9, 4, 4)), np.eye(4)
+    for axis in range(3):
+        sign = -np.ones(4)
+        sign[[0, axis + 1]] = 1.0
+        linear[4 * axis] = np.diag(sign)  # R[axis, axis] enters every diagonal entry
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        # w times the axis' component, from the antisymmetric part; the product of the other two, from the symmetric one.
+        for row, column, value in ((0, axis + 1, 1.0), (axis + 1, 0, 1.0)):
+            linear[3 * j + i, row, column] = value
+            linear[3 * i + j, row, column] = -value
+        for row, column in ((i + 1, j + 1), (j + 1, i + 1)):
+            linear[3 * j + i, row, column] = 1.0
+            linear[3 * i + j, row, column] = 1.0
+    return linear.reshape(9, 16), constant.reshape(16)
+
+
+_OUTER_LINEAR, _OUTER_CONSTANT = _outer_product_map()
+
+
+def from_matrix(rotation: Floats) -> Floats:
+    """The quaternions (N, 4), w >= 0, of rotation matrices (N, 3, 3).
+
+    The entries of R are linear in q qᵀ, whose every row is q times one of its components; the row of the largest
+    component is the well-conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
+    """
+    n = len(rotation)
+    outer = (rotation.reshape(n, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT).reshape(n, 4, 4)
+    largest = outer.diagonal(axis1=-2, axis2=-1).argmax(axis=-1)
+    return canonical(normalised(outer[np.arange(n), largest]))

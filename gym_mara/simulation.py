@@ -1,0 +1,156 @@
+"""Simulation: joins a robot, a backend and a task, for N arms. The environments are its two faces."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+
+from gym_mara.backends import make_backend
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.statistics import EpisodeStatistics
+from gym_mara.tasks import Task, make_task
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Outcome(NamedTuple):
+    """What one step brought, per arm."""
+
+    observation: Floats
+    """(N, O); where an arm collided, of the colliding pose."""
+    reward: Floats
+    """(N,)."""
+    terminated: Mask
+    """(N,)."""
+    info: dict[str, NDArray[Any]]
+    """The task's reward terms and `collided`, each (N,)."""
+
+
+class Simulation:
+    """N arms of one robot, moved by one backend, judged by one task.
+
+    Args:
+        task: the name of a task, or a task.
+        num_envs: N.
+        robot: a robot's name, the path of a URDF, or a RobotModel.
+        ee_frame: the end-effector link of a URDF of your own.
+        backend: the name of a backend.
+        options: values of the task and settings of the backend, by keyword.
+
+    Raises:
+        GymMaraError: a name is unknown, or a value is out of its range.
+        MissingExtraError: a library is not installed.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        num_envs: int,
+        robot: str | RobotModel,
+        ee_frame: str | None,
+        backend: str,
+        options: dict[str, Any],
+    ) -> None:
+        if (
+            isinstance(num_envs, bool)
+            or not isinstance(num_envs, (int, np.integer))
+            or num_envs < 1
+        ):
+            raise GymMaraError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+        self.num_envs = int(num_envs)
+        self.task, settings = make_task(task, options)
+        self.robot = RobotModel.load(robot, ee_frame)
+        self.backend = make_backend(backend, self.robot, self.num_envs, settings)
+        self.goal = self.task.goal(self.robot, self.num_envs)
+        start = self.robot.home if self.task.start_q is None else self.task.start_q
+        self._start = np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1))
+        self._started = False
+        self._closed = False
+        self.statistics = EpisodeStatistics(self.num_envs)
+        self.observation_space = self.task.observation_space(
+            self.robot, self.goal, self.backend.joint_velocity
+        )
+        self.action_space = Box(-np.pi, np.pi, (self.robot.num_joints,), np.float32)
+        # The joint targets that can come about: within the action space and the joint limits, rad.
+        self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
+        self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
+
+    def reset(self, mask: Mask | None = None) -> Floats:
+        """Begin new episodes, of all arms or of those that the mask (N,) names; the observations (N, O) then."""
+        self._check_open()
+        self.backend.reset(self._start, mask)
+        self.statistics.clear(slice(None) if mask is None else mask)
+        self._started = True
+        return self.task.observe(self.backend.state, self.goal)
+
+    def step(self, action: ArrayLike) -> Outcome:
+        """Move every arm for one control period towards its joint targets (N, J), rad.
+
+        Raises:
+            GymMaraError: the action has the wrong shape or is not finite; nothing has moved then.
+            ResetNeeded, ClosedEnvironmentError: the environment was not reset, or is closed.
+        """
+        self._check_open()
+        if not self._started:
+            raise ResetNeeded("call reset() before the first step()")
+        state = self.backend.step(self._target(action))
+        observation = self.task.observe(state, self.goal)
+        reward, info = self.task.reward(state, self.goal)
+        terminated = self.task.terminated(state, self.goal)
+        collided = state.collided
+        if self.task.on_collision != "continue" and collided.any():
+            if self.task.on_collision == "reset":
+                self.backend.reset(self._start, collided)
+            else:
+                terminated = terminated | collided
+        self.statistics.add(info.get("distance", reward * np.nan), reward, collided)
+        return Outcome(observation, reward, terminated, info | {"collided": collided})
+
+    def _target(self, action: ArrayLike) -> Floats:
+        """The joint targets that an action asks for, clipped to the action space and the joint limits."""
+        try:
+            target = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise GymMaraError(f"an action must be an array of numbers: {error}") from error
+        if target.shape != self._start.shape:
+            raise GymMaraError(
+                f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
+                f"{self.robot.name} wants {self._start.shape[1:] if self.num_envs == 1 else self._start.shape}"
+            )
+        if not np.isfinite(target).all():
+            raise GymMaraError(
+                "the action holds NaN or infinity; joint targets must be finite (rad)"
+            )
+        return np.clip(target, self.target_low, self.target_high)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ClosedEnvironmentError("the environment is closed; make a new one")
+
+    def save(self) -> dict[str, Any]:
+        """A snapshot of the arms and of the episodes' statistics."""
+        return {
+            "backend": self.backend.save(),
+            "statistics": copy.deepcopy(self.statistics),
+            "started": self._started,
+        }
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot."""
+        self._check_open()
+        self.backend.restore(snapshot["backend"])
+        self.statistics = copy.deepcopy(snapshot["statistics"])
+        self._started = snapshot["started"]
+
+    def close(self) -> None:
+        """Free the backend; closing twice does no harm."""
+        if not self._closed:
+            self._closed = True
+            self.backend.close()

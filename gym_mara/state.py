@@ -1,0 +1,31 @@
+"""SimState: what a backend reports, and all that a task sees of the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SimState:
+    """The state of N arms at one instant; every array is fresh and may be kept.
+
+    Positions and orientations are those of the robot's end-effector frame in the world frame.
+    """
+
+    q: NDArray[np.float64]
+    """Joint positions (N, J), rad (m for a prismatic joint)."""
+    qd: NDArray[np.float64]
+    """Joint velocities (N, J), rad/s (m/s), at this instant."""
+    ee_position: NDArray[np.float64]
+    """(N, 3), m."""
+    ee_quaternion: NDArray[np.float64]
+    """(N, 4), [w, x, y, z], w >= 0."""
+    ee_velocity: NDArray[np.float64]
+    """Linear velocity J(q) q̇ of the end-effector frame's origin (N, 3), m/s."""
+    collided: NDArray[np.bool_]
+    """(N,): links that may collide touched at this instant or at any during the last control period."""
+    time: NDArray[np.float64]
+    """Simulated time since the arm's last reset (N,), s."""
