@@ -73,12 +73,12 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
         """
         outcome = self.simulation.step(np.asarray(action)[None])
-        info = {name: values[0].item() for name, values in outcome.info.items()}
+        info: dict[str, Any] = {name: values.item() for name, values in outcome.info.items()}
         terminated = bool(outcome.terminated[0])
         if terminated or self.simulation.statistics.steps[0] == self._max_episode_steps():
             summary = self.simulation.statistics.summary()
-            info["statistics"] = {name: values[0].item() for name, values in summary.items()}
-        return outcome.observation[0], outcome.reward[0].item(), terminated, False, info
+            info["statistics"] = {name: values.item() for name, values in summary.items()}
+        return outcome.observation[0], outcome.reward.item(), terminated, False, info
 
     def _max_episode_steps(self) -> int | None:
         """When Gymnasium's TimeLimit, which `gymnasium.make` wraps around, ends the episode."""

@@ -18,10 +18,14 @@ _RIGHT_SIGN = np.array(
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
+def right_matrix(b: Floats) -> Floats:
+    """The matrices (..., 4, 4) that turn a into a ⊗ b, for quaternions b (..., 4)."""
+    return b[..., _RIGHT_INDEX] * _RIGHT_SIGN
+
+
 def multiply(a: Floats, b: Floats) -> Floats:
     """The Hamilton product a ⊗ b of quaternions (..., 4)."""
-    matrix = b[..., _RIGHT_INDEX] * _RIGHT_SIGN
-    return (matrix @ a[..., None])[..., 0]
+    return (right_matrix(b) @ a[..., None])[..., 0]
 
 
 def conjugate(q: Floats) -> Floats:
@@ -31,12 +35,12 @@ def conjugate(q: Floats) -> Floats:
 
 def canonical(q: Floats) -> Floats:
     """Of the two quaternions (..., 4) of a rotation the one with w >= 0."""
-    return np.where(q[..., :1] < 0.0, -q, q)
+    return q * np.copysign(1.0, q[..., :1])
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:
     """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, w the real part of a ⊗ conj(b)."""
-    w = np.abs((a * b).sum(axis=-1))
+    w = np.abs(np.add.reduce(a * b, axis=-1))
     return 2.0 * np.arccos(np.minimum(w, 1.0))
 
 
@@ -72,7 +76,9 @@ def from_matrix(rotation: Floats) -> Floats:
     The entries of R are linear in q qᵀ, whose every row is q times one of its components; the row of the largest
     component is the well-conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
     """
-    n = len(rotation)
-    outer = (rotation.reshape(n, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT).reshape(n, 4, 4)
-    largest = outer.diagonal(axis1=-2, axis2=-1).argmax(axis=-1)
-    return canonical(normalised(outer[np.arange(n), largest]))
+    rows = np.arange(len(rotation))
+    outer = rotation.reshape(-1, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
+    largest = outer[:, 0, ::5].argmax(axis=-1)  # of the diagonal of 4 q qᵀ
+    row = outer.reshape(-1, 4, 4)[rows, largest]
+    length = np.copysign(2.0 * np.sqrt(row[rows, largest]), row[:, 0])
+    return row / length[:, None]

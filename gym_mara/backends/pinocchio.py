@@ -102,12 +102,11 @@ class PinocchioBackend(Backend):
     def state(self) -> SimState:
         if self._collided is None:
             self._collided = self._checker.check(self._q)
-        frames = self._kinematics.frames(self._q)
-        position, quaternion = self._kinematics.pose(frames)
-        if self._qd.any():
-            velocity = self._kinematics.velocity(frames, position, self._qd)
+        position, quaternion = self._kinematics.pose(self._q)
+        if self.max_joint_velocity is None:  # at rest
+            velocity = np.zeros((self.num_envs, 3))
         else:
-            velocity = np.zeros_like(position)
+            velocity = self._kinematics.velocity(self._q, self._qd)
         return SimState(
             q=self._q.copy(),
             qd=self._qd.copy(),

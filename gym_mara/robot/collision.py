@@ -56,14 +56,22 @@ class CoalChecker(CollisionChecker):
 
     def __init__(self, robot: RobotModel) -> None:
         super().__init__(robot)
+        # For one configuration at a time: an arm has too few bodies for a tree of their boxes to pay.
+        self._data = robot.model.createData()
+        self._naive = pin.BroadPhaseManager_NaiveCollisionManager(
+            robot.model, robot.geometry, robot.geometry.createData()
+        )
+        # For many: the only broad phase that Pinocchio spreads over threads.
         self._threads = available_cpus()
         self._pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
             robot.model, robot.geometry, self._threads
         )
 
     def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        threads = self._threads if len(q) >= self._PARALLEL_FROM else 1
-        result = pin.computeCollisionsInParallel(threads, self._pool, q.T, True, False)
+        if len(q) < self._PARALLEL_FROM:
+            model, data, naive = self.robot.model, self._data, self._naive
+            return np.array([pin.computeCollisions(model, data, naive, row, True) for row in q])
+        result = pin.computeCollisionsInParallel(self._threads, self._pool, q.T, True, False)
         return np.asarray(result, dtype=np.bool_).reshape(len(q))
 
 

@@ -1,12 +1,12 @@
-"""Forward kinematics of a chain for many configurations at once, in NumPy.
+"""Forward kinematics of a chain, for one configuration or for thousands.
 
-Pinocchio computes one configuration a call; from Python the calls cost more than the arithmetic. Its model gives the
-constants here, and is the referee in the tests.
+Pinocchio computes one configuration a call; for many, the calls from Python cost more than the arithmetic. So few
+configurations go through Pinocchio, and many through NumPy, with constants from Pinocchio's model; the two agree to
+1e-12 (tests/robot/test_kinematics.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,95 +17,100 @@ from gym_mara import rotations
 
 Floats = NDArray[np.float64]
 
+# From this many configurations on NumPy is the faster.
+BATCH_FROM = 8
 
-@dataclass(frozen=True, eq=False)
+
 class Kinematics:
-    """The chain of J joints as constants; frames are homogeneous transforms to the world, 4 × 4.
+    """The forward kinematics of a Pinocchio model that is one chain of J revolute and prismatic joints.
 
-    Every operation is done per configuration in a fixed order: a result does not depend on the batch it is in.
-    An instance reuses its work space: it belongs to one thread.
+    An instance has a work space of its own: it belongs to one thread.
+
+    Args:
+        model: Pinocchio's model.
+        ee_frame_id: the number of its end-effector frame.
     """
 
-    terms: Floats
-    """(J, 3, 16): the transform of a joint in its parent's frame is terms[0] + c·terms[1] + s·terms[2], flattened,
-    with c, s the cosine and sine of its angle; for a prismatic joint c is its displacement and s zero."""
-    axes: Floats
-    """(J, 3), each joint's axis in its own frame."""
-    prismatic: NDArray[np.bool_]
-    """(J,)."""
-    tool: Floats
-    """(4, 4), the end-effector frame in the last joint's."""
-    _buffers: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
+    def __init__(self, model: pin.Model, ee_frame_id: int) -> None:
+        self._model, self._data, self._frame = model, model.createData(), ee_frame_id
+        self._tool: Floats = model.frames[ee_frame_id].placement.homogeneous[None]
+        motions = np.array([_motion_axis(joint) for joint in model.joints[1:]])
+        self.prismatic: NDArray[np.bool_] = np.logical_not(np.any(motions[:, 3:], axis=1))
+        """Which joints slide (J,)."""
+        self._any_prismatic = bool(self.prismatic.any())
+        self._axes = np.where(self.prismatic[:, None], motions[:, :3], motions[:, 3:])
+        # A joint's transform in its parent's frame is terms[0] + c·terms[1] + s·terms[2], flattened, with c and s the
+        # cosine and sine of its angle (Rodrigues' formula); for a prismatic joint c is its displacement and s zero.
+        local = np.zeros((len(motions), 3, 4, 4))
+        for terms, axis, slides in zip(local, self._axes, self.prismatic.tolist(), strict=True):
+            along = np.outer(axis, axis)
+            terms[0, :3, :3], terms[0, 3, 3] = np.eye(3) if slides else along, 1.0
+            if slides:
+                terms[1, :3, 3] = axis
+            else:
+                terms[1, :3, :3], terms[2, :3, :3] = np.eye(3) - along, pin.skew(axis)
+        placements = np.array([p.homogeneous for p in model.jointPlacements[1:]])
+        self._terms = (placements[:, None] @ local).reshape(len(motions), 1, 3, 16)
+        self._work_spaces: dict[int, tuple[Floats, Floats]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.terms, self.axes, self.prismatic, self.tool)
+        return type(self), (self._model, self._frame)
 
-    @classmethod
-    def of(cls, model: pin.Model, ee_frame_id: int) -> Kinematics:
-        """The kinematics of a Pinocchio model that is one chain of revolute and prismatic joints."""
-        terms, axes, prismatic = [], [], []
-        for joint in model.joints[1:]:
-            data = joint.createData()
-            axis = _motion_axis(joint, data)
-            is_prismatic = bool(np.allclose(axis[3:], 0.0))
-            direction = axis[:3] if is_prismatic else axis[3:]
-            along = np.outer(direction, direction)
-            local = np.zeros((3, 4, 4))
-            if is_prismatic:
-                local[0] = np.eye(4)
-                local[1, :3, 3] = direction
-            else:  # Rodrigues' formula
-                local[0, :3, :3], local[0, 3, 3] = along, 1.0
-                local[1, :3, :3] = np.eye(3) - along
-                local[2, :3, :3] = pin.skew(direction)
-            placement = model.jointPlacements[joint.id].homogeneous
-            terms.append((placement @ local).reshape(3, 16))
-            axes.append(direction)
-            prismatic.append(is_prismatic)
-        tool = model.frames[ee_frame_id].placement.homogeneous
-        return cls(np.array(terms), np.array(axes), np.array(prismatic), np.array(tool))
+    def pose(self, q: Floats) -> tuple[Floats, Floats]:
+        """Position (N, 3) m and quaternion (N, 4), w >= 0, of the end-effector frame at q (N, J)."""
+        if len(q) < BATCH_FROM:
+            return self._pose_one_by_one(q)
+        local = self._local_transforms(q)
+        # Neighbours first, all in one call; then what is left, one by one.
+        even = len(local) // 2 * 2
+        factors = [*(local[0:even:2] @ local[1:even:2]), *local[even:], self._tool]
+        product = factors[0]
+        for factor in factors[1:]:
+            product = product @ factor
+        return product[:, :3, 3].copy(), rotations.from_matrix(product[:, :3, :3])
 
-    def frames(self, q: Floats) -> Floats:
-        """The joints' frames (J, N, 4, 4) in the world at configurations q (N, J); overwritten by the next call."""
-        count = len(q)
-        coefficients, transforms = self._buffer(count)
-        np.cos(q.T, out=coefficients[:, :, 0, 1])
-        np.sin(q.T, out=coefficients[:, :, 0, 2])
-        if self.prismatic.any():
-            coefficients[self.prismatic, :, 0, 1] = q.T[self.prismatic]
-            coefficients[self.prismatic, :, 0, 2] = 0.0
-        np.matmul(coefficients, self.terms[:, None], out=transforms[:, :, None, :])
-        frames = transforms.reshape(-1, count, 4, 4)
+    def _pose_one_by_one(self, q: Floats) -> tuple[Floats, Floats]:
+        poses = np.empty((len(q), 7))
+        for row, configuration in enumerate(q):
+            pin.forwardKinematics(self._model, self._data, configuration)
+            placement = pin.updateFramePlacement(self._model, self._data, self._frame)
+            poses[row] = pin.SE3ToXYZQUAT(placement)
+        return poses[:, :3], rotations.canonical(poses[:, [6, 3, 4, 5]])
+
+    def velocity(self, q: Floats, qd: Floats) -> Floats:
+        """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""
+        frames = self._local_transforms(q).copy()
         for joint in range(1, len(frames)):
             frames[joint] = frames[joint - 1] @ frames[joint]
-        return frames
+        tool = (frames[-1] @ self._tool)[:, :3, 3]
+        axes = (frames[:, :, :3, :3] @ self._axes[:, None, :, None])[..., 0]
+        turning = np.cross(axes, tool - frames[:, :, :3, 3])
+        columns = np.where(self.prismatic[:, None, None], axes, turning)
+        return (columns * qd.T[:, :, None]).sum(axis=0)
 
-    def pose(self, frames: Floats) -> tuple[Floats, Floats]:
-        """Position (N, 3) m and quaternion (N, 4) of the end-effector frame, from the joints' frames."""
-        tool = frames[-1] @ self.tool
-        return tool[:, :3, 3].copy(), rotations.from_matrix(tool[:, :3, :3])
+    def _local_transforms(self, q: Floats) -> Floats:
+        """Each joint's transform in its parent's frame (J, N, 4, 4); overwritten by the next call.
 
-    def velocity(self, frames: Floats, position: Floats, qd: Floats) -> Floats:
-        """The linear velocity J(q) q̇ (N, 3) m/s of the end-effector frame's origin at `position` (N, 3)."""
-        axes = (frames[:, :, :3, :3] @ self.axes[:, None, :, None])[..., 0]
-        arms = np.where(
-            self.prismatic[:, None, None], axes, np.cross(axes, position - frames[:, :, :3, 3])
-        )
-        return (arms * qd.T[:, :, None]).sum(axis=0)
-
-    def _buffer(self, count: int) -> tuple[Floats, Floats]:
-        # Arrays of this size come fresh from the system at every call, which costs more than the arithmetic on them.
-        if count not in self._buffers:
-            joints = len(self.axes)
-            if len(self._buffers) > 8:
-                self._buffers.clear()
-            coefficients = np.ones((joints, count, 1, 3))
-            self._buffers[count] = coefficients, np.empty((joints, count, 16))
-        return self._buffers[count]
+        Arrays of this size come fresh from the system, which costs more than the arithmetic on them: they are kept.
+        """
+        count, joints = len(q), len(self._axes)
+        if count not in self._work_spaces:
+            if len(self._work_spaces) > 8:
+                self._work_spaces.clear()
+            flat = np.empty((joints, count, 1, 16))
+            self._work_spaces[count] = np.ones((joints, count, 1, 3)), flat
+        coefficients, flat = self._work_spaces[count]
+        np.cos(q.T, out=coefficients[:, :, 0, 1])
+        np.sin(q.T, out=coefficients[:, :, 0, 2])
+        if self._any_prismatic:
+            coefficients[self.prismatic, :, 0, 1] = q.T[self.prismatic]
+            coefficients[self.prismatic, :, 0, 2] = 0.0
+        np.matmul(coefficients, self._terms, out=flat)
+        return flat.reshape(joints, count, 4, 4)
 
 
-def _motion_axis(joint: pin.JointModel, data: pin.JointData) -> Floats:
+def _motion_axis(joint: pin.JointModel) -> Floats:
     """The motion subspace (6,) of a one-dimensional joint in its own frame: linear part, then angular."""
-    q = np.zeros(joint.idx_q + joint.nq)
-    joint.calc(data, q)
+    data = joint.createData()
+    joint.calc(data, np.zeros(joint.idx_q + joint.nq))
     return np.array(data.S).reshape(6)

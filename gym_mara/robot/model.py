@@ -126,7 +126,7 @@ class RobotModel:
 
     def kinematics(self) -> Kinematics:
         """Forward kinematics of many configurations at once, with a work space of its own."""
-        return Kinematics.of(self.model, self.ee_frame_id)
+        return Kinematics(self.model, self.ee_frame_id)
 
     @cached_property
     def reach(self) -> Floats:

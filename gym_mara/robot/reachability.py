@@ -78,7 +78,7 @@ def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
     rng = np.random.default_rng(0)
     candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
     candidates = np.vstack([candidates, robot.home])  # where all else collides
-    position, quaternion = kinematics.pose(kinematics.frames(candidates))
+    position, quaternion = kinematics.pose(candidates)
     away = np.linalg.norm(position - position[-1], axis=1)
     good = ~checker.check(candidates) & (away > 0.25 * away.max())
     chosen = int(good.argmax()) if good.any() else len(candidates) - 1

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from gym_mara import rotations
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
@@ -19,13 +20,22 @@ Floats = NDArray[np.float64]
 ON_COLLISION = ("reset", "terminate", "continue")
 
 
-class Goal(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Goal:
     """The poses to reach, in the world frame."""
 
     position: Floats
     """(N, 3), m."""
     quaternion: Floats
     """(N, 4), [w, x, y, z]."""
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        return rotations.right_matrix(rotations.conjugate(self.quaternion))
+
+    def orientation_error(self, quaternion: Floats) -> Floats:
+        """q ⊗ conj(goal) (N, 4), w >= 0, of end-effector orientations q (N, 4)."""
+        return rotations.canonical((self._inverse @ quaternion[..., None])[..., 0])
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,7 @@ class ReachTask(Task):
         """
         parts = [state.q, state.ee_position - goal.position, state.ee_velocity]
         if self.orientation:
-            error = rotations.multiply(state.ee_quaternion, rotations.conjugate(goal.quaternion))
-            parts.insert(2, rotations.canonical(error))
+            parts.insert(2, goal.orientation_error(state.ee_quaternion))
         return np.concatenate(parts, axis=-1)
 
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
@@ -112,7 +111,7 @@ class ReachTask(Task):
         `reward_collision`.
         """
         error = state.ee_position - goal.position
-        squared = (error * error).sum(axis=-1)
+        squared = np.add.reduce(error * error, axis=-1)
         distance = np.sqrt(squared / 3.0)
         angle = rotations.angle_between(state.ee_quaternion, goal.quaternion)
         near = rewards.distance_reward(distance, self.alpha, self.kappa)
@@ -129,8 +128,8 @@ class ReachTask(Task):
             "position_error": np.sqrt(squared),
             "angle_error": angle,
             "reward_distance": near,
-            "reward_orientation": np.ones_like(near) if aligned is None else aligned,
-            "reward_collision": np.zeros_like(near) if collision is None else collision,
+            "reward_orientation": np.ones(len(near)) if aligned is None else aligned,
+            "reward_collision": np.zeros(len(near)) if collision is None else collision,
         }
 
 

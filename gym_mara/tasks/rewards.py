@@ -5,6 +5,10 @@ Source: gym-gazebo2 (arXiv 1903.06278); its constants are the defaults of `gym_m
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,22 +20,31 @@ def distance_reward(distance: Floats, alpha: float, kappa: float) -> Floats:
 
     (e^(-α d) - e^(-α)) / (1 - e^(-α)) + 10 (e^(-α d/κ) - e^(-α/κ)) / (1 - e^(-α/κ)) of d (...,), m.
     """
-    return _decay(distance, alpha) + 10.0 * _decay(distance, alpha / kappa)
+    # Each summand is an exponential, scaled and shifted to go from its height at 0 m to 0 at 1 m.
+    basin, peak = _decay(alpha, 1.0), _decay(alpha / kappa, 10.0)
+    wide = basin.scale * np.exp(-basin.rate * distance)
+    return wide + peak.scale * np.exp(-peak.rate * distance) - (basin.shift + peak.shift)
+
+
+class _Decay(NamedTuple):
+    rate: float
+    scale: float
+    shift: float
+
+
+@lru_cache(maxsize=64)
+def _decay(rate: float, height: float) -> _Decay:
+    scale = height / -math.expm1(-rate)
+    return _Decay(rate, scale, scale * math.exp(-rate))
 
 
 def orientation_factor(angle: Floats, beta: float, gamma: float) -> Floats:
     """From 1 at angle 0 down to γ / (1 + γ) at π: (1 - (θ/π)^β + γ) / (1 + γ) of θ (...,), rad."""
-    return (1.0 - (angle / np.pi) ** beta + gamma) / (1.0 + gamma)
+    return 1.0 - angle**beta * (np.pi**-beta / (1.0 + gamma))
 
 
 def collision_penalty(
     collided: NDArray[np.bool_], distance: Floats, delta: float, eta: float
 ) -> Floats:
     """δ (2 min(d, 0.5))^η on a collision, else 0, of d (...,), m."""
-    return np.where(collided, delta * (2.0 * np.minimum(distance, 0.5)) ** eta, 0.0)
-
-
-def _decay(distance: Floats, rate: float) -> Floats:
-    """An exponential from 1 at 0 m to 0 at 1 m."""
-    end = np.exp(-rate)
-    return (np.exp(-rate * distance) - end) / (1.0 - end)
+    return collided * (delta * np.minimum(2.0 * distance, 1.0) ** eta)

@@ -1,0 +1,203 @@
+"""Reward regression: record a task's rewards over a fixed set of states, and find what moved since.
+
+A record is a CSV file. Its first line, a comment, says what was recorded; then comes a row per state: the configuration
+that the arm is put at, the terms of the reward, and the reward. The states are read from the record, so that a check
+depends on nothing but the code under test.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError
+from gym_mara.robot.reachability import solve_ik
+from gym_mara.simulation import Simulation
+
+Floats = NDArray[np.float64]
+
+_HEADER = "# gym_mara reward record: "
+
+
+@dataclass(frozen=True)
+class Record:
+    """The rewards of one environment on one backend over S states."""
+
+    env: str
+    backend: str
+    options: dict[str, Any]
+    """Keyword arguments of the environment besides the backend."""
+    q: Floats
+    """The configurations (S, J), rad."""
+    values: dict[str, Floats]
+    """The terms of the reward, `collided` and `reward`, each (S,)."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A value that is not what was recorded."""
+
+    row: int
+    """The state's number, from 0."""
+    name: str
+    recorded: float
+    now: float
+
+    def __str__(self) -> str:
+        return (
+            f"state {self.row}: {self.name} was {self.recorded:.9g}, is {self.now:.9g} "
+            f"(moved by {self.now - self.recorded:+.3g})"
+        )
+
+
+def record(
+    env: str, backend: str = "pinocchio", options: dict[str, Any] | None = None, states: int = 256
+) -> Record:
+    """Compute the rewards of an environment over a grid of states.
+
+    Half of the states fill the joints' ranges evenly (a Kronecker sequence); half lie on the way from the start to the
+    target, ever closer together, down to 0.1 mm and less before it: there the reward is steep.
+
+    Raises:
+        GymMaraError: a name is unknown, or there are less than two states.
+    """
+    if states < 2:
+        raise GymMaraError(f"states must be at least 2, not {states}")
+    simulation = Simulation(env, 1, **_robot(options or {}), backend=backend)
+    try:
+        q = _grid(simulation, states)
+    finally:
+        simulation.close()
+    return evaluate(env, backend, options or {}, q)
+
+
+def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
+    """Compute the rewards of an environment at configurations q (S, J), rad, where the arm rests.
+
+    Raises:
+        GymMaraError: a name is unknown, or the configurations do not fit the robot.
+    """
+    if q.ndim != 2 or len(q) < 1:
+        raise GymMaraError("a record needs at least one state")
+    simulation = Simulation(env, len(q), **_robot(options), backend=backend)
+    try:
+        for number, row in enumerate(q):
+            simulation.robot.checked_q(row, f"state {number} of the record")
+        simulation.backend.reset(q)
+        state = simulation.backend.state
+        reward, terms = simulation.task.reward(state, simulation.goal)
+    finally:
+        simulation.close()
+    values = {**terms, "collided": state.collided.astype(np.float64), "reward": reward}
+    return Record(env, backend, options, q, values)
+
+
+def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Moved]:
+    """What differs by more than the tolerance, in the order of the states.
+
+    Raises:
+        GymMaraError: the two do not hold the same terms.
+    """
+    if recorded.values.keys() != now.values.keys():
+        raise GymMaraError(
+            f"the record holds {', '.join(recorded.values)}; the task now has {', '.join(now.values)}: "
+            "record anew if that is meant"
+        )
+    moved = [
+        Moved(row, name, float(old), float(new))
+        for name, column in recorded.values.items()
+        for row, (old, new) in enumerate(zip(column, now.values[name], strict=True))
+        if not abs(new - old) <= tolerance
+    ]
+    return sorted(moved, key=lambda m: m.row)
+
+
+def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> list[Moved]:
+    """Compute a record anew, on its own backend or another, and return what moved.
+
+    Raises:
+        GymMaraError: the file is missing or damaged, or the task's terms are others now.
+    """
+    recorded = read(file)
+    now = evaluate(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
+    return compare(recorded, now, tolerance)
+
+
+def write(file: Path, recorded: Record) -> None:
+    """Write a record to a new file.
+
+    Raises:
+        GymMaraError: the file exists, or cannot be written; nothing is overwritten.
+    """
+    about = {"env": recorded.env, "backend": recorded.backend, "options": recorded.options}
+    text = io.StringIO()
+    text.write(_HEADER + json.dumps(about) + "\n")
+    writer = csv.writer(text, lineterminator="\n")
+    joints = [f"q{j + 1}" for j in range(recorded.q.shape[1])]
+    writer.writerow([*joints, *recorded.values])
+    columns = np.column_stack([recorded.q, *recorded.values.values()])
+    writer.writerows([repr(value) for value in row] for row in columns.tolist())
+    try:
+        with file.open("x") as stream:
+            stream.write(text.getvalue())
+    except FileExistsError:
+        raise GymMaraError(
+            f"{str(file)!r} exists and is not overwritten: delete it first"
+        ) from None
+    except OSError as error:
+        raise GymMaraError(f"cannot write {str(file)!r}: {error.strerror}") from error
+
+
+def read(file: Path) -> Record:
+    """Read a record.
+
+    Raises:
+        GymMaraError: the file is missing or damaged.
+    """
+    try:
+        header, *lines = file.read_text().splitlines()
+        if not header.startswith(_HEADER):
+            raise ValueError("it does not begin with the header of a record")
+        about = json.loads(header.removeprefix(_HEADER))
+        names = lines[0].split(",")
+        columns = np.array([[float(x) for x in line.split(",")] for line in lines[1:]]).T
+        joints = sum(name.removeprefix("q").isdigit() for name in names)
+        values = dict(zip(names[joints:], columns[joints:], strict=True))
+        return Record(about["env"], about["backend"], about["options"], columns[:joints].T, values)
+    except OSError as error:
+        raise GymMaraError(f"cannot read {str(file)!r}: {error.strerror}") from error
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        raise GymMaraError(f"{str(file)!r} is no reward record: {error}") from error
+
+
+def _robot(options: dict[str, Any]) -> dict[str, Any]:
+    """The options as Simulation takes them."""
+    rest = {k: v for k, v in options.items() if k not in ("robot", "ee_frame")}
+    return {
+        "robot": options.get("robot", "mara"),
+        "ee_frame": options.get("ee_frame"),
+        "options": rest,
+    }
+
+
+def _grid(simulation: Simulation, states: int) -> Floats:
+    robot, goal = simulation.robot, simulation.goal
+    # Kronecker sequence of the generalised golden ratio: even in any number of dimensions.
+    phi = 2.0
+    for _ in range(64):
+        phi = (1.0 + phi) ** (1.0 / (robot.num_joints + 1))
+    steps = phi ** -np.arange(1.0, robot.num_joints + 1)
+    spread_out = states // 2
+    unit = (0.5 + np.outer(np.arange(1, spread_out + 1), steps)) % 1.0
+    even = simulation.target_low + unit * (simulation.target_high - simulation.target_low)
+    at_target = solve_ik(robot, goal.position[0], goal.quaternion[0])
+    left = np.geomspace(1.0, 1e-4, states - spread_out)[:, None]
+    near = at_target + left * (robot.home - at_target)
+    return np.vstack([even, near])
