@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import (
     TensorBoardOutputFormat,
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from gym_mara.agents import presets
 from gym_mara.agents.callbacks import Keeper, Report, base_env, restore_random_state
@@ -74,17 +74,18 @@ def resume(path: Path, report: Report) -> RunFolder:
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
     """An untrained agent, with its environment, as a configuration asks for it."""
-    # The networks are small: a second thread costs more than it brings.
-    torch.set_num_threads(1)
     preset = presets.Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
+    return new_agent(config.algo, preset, env, config.seed)
+
+
+def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
+    """An untrained agent of an algorithm and a preset on any environment of Stable-Baselines3."""
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    return algorithm_class(config.algo)(
-        "MlpPolicy", wrapped, seed=config.seed, device="cpu", **arguments
-    )
+    return algorithm_class(algo)("MlpPolicy", wrapped, seed=seed, device="cpu", **arguments)
 
 
 def _schedule(value: Any) -> Any:
@@ -105,6 +106,7 @@ class LinearSchedule:
 
 
 def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
+    # The networks are small: a second thread costs more than it brings.
     torch.set_num_threads(1)
     model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
     keeper = Keeper(run, CHECKPOINT_EVERY, best, report)

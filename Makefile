@@ -1,0 +1,45 @@
+# make demo and make test are all that a newcomer needs; each sets up what it needs, once.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+READY = $(VENV)/.ready
+PIP_INSTALL = -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test lint bench accuracy test-oldest test-wheel clean
+
+demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under runs/.
+	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
+
+test: $(READY) ## Run the tests.
+	$(BIN)/python -m pytest -n auto
+
+lint: $(READY) ## Check format, lint and types.
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some minutes.
+	$(BIN)/python benchmarks/speed.py
+
+accuracy: $(READY) ## Train three seeds of 1M steps on each environment and print their accuracy; half an hour.
+	$(BIN)/python benchmarks/accuracy.py
+
+test-oldest: ## Run the tests with the oldest Gymnasium that is supported.
+	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt
+
+test-wheel: ## Build the wheel, install it away from the checkout, and use every environment from there.
+	.ci/test-wheel $(PYTHON)
+
+clean: ## Remove the virtual environments and what the tools left.
+	rm -rf .venv .venv-oldest build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+CONSTRAINTS ?= constraints.txt
+
+$(READY): pyproject.toml $(CONSTRAINTS)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python $(PIP_INSTALL) -c $(CONSTRAINTS) -e '.[dev]'
+	touch $@
+
+$(VENV)/.bench: $(READY)
+	$(BIN)/python $(PIP_INSTALL) -e '.[bench]' || echo "the peers cannot be installed here; measuring without them"
+	touch $@

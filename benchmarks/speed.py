@@ -1,0 +1,189 @@
+"""Environment steps per second, against the floor and against peers, all in one run; prints Markdown.
+
+The floor is what any environment on Pinocchio must spend: forward kinematics alone, and with Coal's batched collision
+check, over the very configurations that the environment visits. Every figure is the best of several repetitions, and
+what is compared is measured in turn: on a shared machine only ratios within one run mean anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+import warnings
+from collections.abc import Callable
+from importlib.metadata import version
+
+import gymnasium
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from training import training_ratio
+
+import gym_mara
+from gym_mara.robot import RobotModel
+from gym_mara.tasks import TASKS
+
+NUM_ENVS = (1, 16, 256, 1024)
+PEERS = {"panda_gym": "PandaReach-v3", "gymnasium_robotics": "FetchReach-v4"}
+REPETITIONS = 5
+SECONDS = 0.5
+
+
+def rates(functions: dict[str, Callable[[], int]]) -> dict[str, float]:
+    """Steps per second of each function, which returns how many it made; the best of several turns."""
+    best = dict.fromkeys(functions, 0.0)
+    for function in functions.values():
+        function()  # warm up
+    for _ in range(REPETITIONS):
+        for name, function in functions.items():
+            steps, start = 0, time.perf_counter()
+            while (elapsed := time.perf_counter() - start) < SECONDS:
+                steps += function()
+            best[name] = max(best[name], steps / elapsed)
+    return best
+
+
+def single(env_id: str, seed: int = 0) -> Callable[[], int]:
+    """Steps of one environment with random actions, through gymnasium.make."""
+    env = gymnasium.make(env_id)
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    actions = [env.action_space.sample() for _ in range(200)]
+
+    def run() -> int:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return len(actions)
+
+    return run
+
+
+def batch(env_id: str, num_envs: int) -> Callable[[], int]:
+    """Steps of the native vector environment with random actions."""
+    envs = gymnasium.make_vec(env_id, num_envs=num_envs)
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    actions = [envs.action_space.sample() for _ in range(10)]
+
+    def run() -> int:
+        for action in actions:
+            envs.step(action)
+        return num_envs * len(actions)
+
+    return run
+
+
+def configurations(num_envs: int) -> NDArray[np.float64]:
+    """The configurations that `batch` visits: random actions, clipped to the joint limits."""
+    robot = RobotModel.load("mara")
+    envs = gymnasium.make_vec("gym_mara/MARA-v0", num_envs=num_envs)
+    envs.action_space.seed(0)
+    actions = np.concatenate([envs.action_space.sample() for _ in range(max(1, 200 // num_envs))])
+    return np.clip(actions.astype(np.float64), robot.lower, robot.upper)
+
+
+def kinematics_floor(q: NDArray[np.float64]) -> Callable[[], int]:
+    """Pinocchio's forward kinematics, one configuration a call: it has no other."""
+    robot = RobotModel.load("mara")
+    model, data, frame = robot.model, robot.model.createData(), robot.ee_frame_id
+
+    def run() -> int:
+        for row in q:
+            pin.forwardKinematics(model, data, row)
+            pin.updateFramePlacement(model, data, frame)
+        return len(q)
+
+    return run
+
+
+def collision_floor(q: NDArray[np.float64]) -> Callable[[], int]:
+    """The forward kinematics above, and Coal's batched check on all cores."""
+    robot = RobotModel.load("mara")
+    threads = len(os.sched_getaffinity(0))
+    pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
+        robot.model, robot.geometry, threads
+    )
+    columns = np.asfortranarray(q.T)
+    kinematics = kinematics_floor(q)
+
+    def run() -> int:
+        pin.computeCollisionsInParallel(threads, pool, columns, True, False)
+        return kinematics()
+
+    return run
+
+
+def row(*cells: object) -> None:
+    """Print a row of a Markdown table."""
+    print("|", " | ".join(str(cell) for cell in cells), "|", flush=True)
+
+
+def print_throughput() -> None:
+    """Every environment at every size beside the floors."""
+    print("\n## Steps per second, random actions\n")
+    row(
+        "environments",
+        *TASKS,
+        "kinematics floor",
+        "with collisions",
+        "MARA / floor",
+        "MARACollisionOrient / floor",
+    )
+    row(*["---"] * (len(TASKS) + 5))
+    for num_envs in NUM_ENVS:
+        q = configurations(num_envs)
+        functions = {name: batch(f"gym_mara/{name}", num_envs) for name in TASKS}
+        measured = rates(
+            {**functions, "kinematics": kinematics_floor(q), "collisions": collision_floor(q)}
+        )
+        row(
+            num_envs,
+            *(f"{rate:,.0f}" for rate in measured.values()),
+            f"{measured['MARA-v0'] / measured['kinematics']:.2f}",
+            f"{measured['MARACollisionOrient-v0'] / measured['collisions']:.2f}",
+        )
+
+
+def print_peers() -> None:
+    """One environment through gymnasium.make, beside the peers that are installed."""
+    functions = {}
+    for module, env_id in PEERS.items():
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                gymnasium.register_envs(__import__(module))
+                functions[env_id] = single(env_id)
+        except Exception as error:
+            print(f"\n{env_id} cannot run here: {type(error).__name__} {error}")
+    ours = "gym_mara/MARACollisionOrient-v0"
+    measured = rates({ours: single(ours), **functions})
+    print("\n## One environment through gymnasium.make\n")
+    row("environment", "steps per second", "ours is faster by")
+    row("---", "---", "---")
+    for name, rate in measured.items():
+        row(name, f"{rate:,.0f}", f"{measured[ours] / rate:.1f}")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--no-training", action="store_true", help="leave out the training")
+    arguments = parser.parse_args()
+    libraries = ", ".join(f"{name} {version(name)}" for name in ("gymnasium", "numpy", "pin"))
+    print(
+        f"gym_mara {gym_mara.__version__}, {libraries}, Python {platform.python_version()}, "
+        f"{len(os.sched_getaffinity(0))} cores"
+    )
+    print_throughput()
+    print_peers()
+    if not arguments.no_training:
+        print("\n## Training, against the same PPO on an environment that does nothing\n")
+        print(training_ratio())
+
+
+if __name__ == "__main__":
+    main()

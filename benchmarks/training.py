@@ -1,0 +1,83 @@
+"""How much longer PPO trains on MARA than on an environment of equal spaces that does nothing."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from gym_mara.agents import presets
+from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.train import new_agent
+
+STEPS = 1_000_000
+SLICES = 5
+
+
+class NothingVecEnv(VecEnv):
+    """Arms that do not move: zeros for observations and rewards, episodes of 2048 steps."""
+
+    def __init__(self, like: VecEnv) -> None:
+        super().__init__(like.num_envs, like.observation_space, like.action_space)
+        self._observation = np.zeros((like.num_envs, *(like.observation_space.shape or ())))
+        self._steps = 0
+
+    def reset(self) -> NDArray[np.float64]:
+        return self._observation.copy()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._steps += 1
+
+    def step_wait(self) -> Any:
+        done = np.full(self.num_envs, self._steps % 2048 == 0)
+        infos: list[dict[str, Any]] = [
+            {"terminal_observation": self._observation[0]} if d else {} for d in done
+        ]
+        rewards = np.zeros(self.num_envs, np.float32)
+        return self._observation.copy(), rewards, done, infos
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise AttributeError(attr_name)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> list[Any]:
+        raise AttributeError(method_name)
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+def training_ratio(task: str = "MARACollisionOrient-v0") -> str:
+    """Train both for 1M steps, slice by slice in turn, and say how the times compare."""
+    torch.set_num_threads(1)
+    preset = presets.preset("ppo", task)
+    ours = make_env(task, "pinocchio", preset.num_envs, {})
+    models = [new_agent("ppo", preset, env, seed=0) for env in (ours, NothingVecEnv(ours))]
+    seconds = [0.0, 0.0]
+    for _ in range(SLICES):
+        for index, model in enumerate(models):
+            seconds[index] += _learn(model, STEPS // SLICES)
+    return (
+        f"{task}, {STEPS:,} steps: {seconds[0]:.1f} s; doing nothing: {seconds[1]:.1f} s; "
+        f"ratio {seconds[0] / seconds[1]:.2f}"
+    )
+
+
+def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
+    start = time.perf_counter()
+    model.learn(steps, reset_num_timesteps=False)
+    return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    print(training_ratio())
