@@ -25,6 +25,7 @@ import gym_mara
 from gym_mara.robot import RobotModel
 from gym_mara.tasks import TASKS
 
+BLIND = "MARA-v0, collision='none'"
 NUM_ENVS = (1, 16, 256, 1024)
 PEERS = {"panda_gym": "PandaReach-v3", "gymnasium_robotics": "FetchReach-v4"}
 REPETITIONS = 5
@@ -62,9 +63,9 @@ def single(env_id: str, seed: int = 0) -> Callable[[], int]:
     return run
 
 
-def batch(env_id: str, num_envs: int) -> Callable[[], int]:
+def batch(env_id: str, num_envs: int, **options: str) -> Callable[[], int]:
     """Steps of the native vector environment with random actions."""
-    envs = gymnasium.make_vec(env_id, num_envs=num_envs)
+    envs = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(10)]
@@ -128,15 +129,18 @@ def print_throughput() -> None:
     row(
         "environments",
         *TASKS,
+        BLIND,
         "kinematics floor",
         "with collisions",
         "MARA / floor",
+        "without collisions / floor",
         "MARACollisionOrient / floor",
     )
-    row(*["---"] * (len(TASKS) + 5))
+    row(*["---"] * (len(TASKS) + 7))
     for num_envs in NUM_ENVS:
         q = configurations(num_envs)
         functions = {name: batch(f"gym_mara/{name}", num_envs) for name in TASKS}
+        functions[BLIND] = batch("gym_mara/MARA-v0", num_envs, collision="none")
         measured = rates(
             {**functions, "kinematics": kinematics_floor(q), "collisions": collision_floor(q)}
         )
@@ -144,6 +148,7 @@ def print_throughput() -> None:
             num_envs,
             *(f"{rate:,.0f}" for rate in measured.values()),
             f"{measured['MARA-v0'] / measured['kinematics']:.2f}",
+            f"{measured[BLIND] / measured['kinematics']:.2f}",
             f"{measured['MARACollisionOrient-v0'] / measured['collisions']:.2f}",
         )
 

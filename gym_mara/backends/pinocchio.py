@@ -28,7 +28,8 @@ class PinocchioBackend(Backend):
         num_envs: how many of it.
         control_period: s.
         max_joint_velocity: rad/s (m/s for a prismatic joint); None for teleports.
-        collision: the collision engine, "coal" (the faster) or "fcl".
+        collision: the collision engine: "coal" (the faster), "fcl", or "none" to see no collisions.
+        collision_threads: how many threads Coal may use; worth it for large batches on idle cores.
         path_resolution: how far, m, any point of the arm moves at most between two checks along a path.
     """
 
@@ -40,6 +41,7 @@ class PinocchioBackend(Backend):
         control_period: float = 0.02,
         max_joint_velocity: float | None = None,
         collision: str = "coal",
+        collision_threads: int = 1,
         path_resolution: float = 0.005,
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
@@ -54,7 +56,7 @@ class PinocchioBackend(Backend):
         if max_joint_velocity is not None:
             self.joint_velocity = np.full(robot.num_joints, float(max_joint_velocity))
         self.path_resolution = path_resolution
-        self._checker = make_checker(collision, robot)
+        self._checker = make_checker(collision, robot, collision_threads)
         self._kinematics = robot.kinematics()
         self._q = np.tile(robot.home, (num_envs, 1))
         self._qd = np.zeros_like(self._q)

@@ -1,8 +1,7 @@
-"""Does an arm collide at these configurations? One small interface, two engines."""
+"""Does an arm collide at these configurations? One small interface, and the engines behind it."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from gym_mara.errors import unknown
+from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot.model import RobotModel
 
 
@@ -29,55 +28,87 @@ class CollisionChecker(ABC):
         return type(self), (self.robot,)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CollisionChecker:
-        return type(self)(self.robot)
+        make, arguments = self.__reduce__()
+        copied: CollisionChecker = make(*arguments)
+        return copied
 
 
-def make_checker(name: str, robot: RobotModel) -> CollisionChecker:
-    """The checker of this name, "coal" or "fcl".
+def make_checker(name: str, robot: RobotModel, threads: int = 1) -> CollisionChecker:
+    """The checker of this name: "coal", "fcl", or "none", which sees no collision.
+
+    Args:
+        name: the engine.
+        robot: the arm.
+        threads: how many threads Coal may use for many configurations.
 
     Raises:
-        GymMaraError: the name is neither.
+        GymMaraError: the name is neither, or the engine has no such number of threads.
         MissingExtraError: the engine is not installed.
     """
+    if threads < 1 or (threads > 1 and name != "coal"):
+        raise GymMaraError(
+            f"collision_threads must be at least 1, and 1 but for 'coal'; not {threads} for {name!r}"
+        )
     if name == "coal":
-        return CoalChecker(robot)
+        return CoalChecker(robot) if threads == 1 else ParallelCoalChecker(robot, threads)
     if name == "fcl":
         from gym_mara.robot.fcl import FclChecker
 
         return FclChecker(robot)
-    raise unknown("collision engine", name, ("coal", "fcl"))
+    if name == "none":
+        return NoChecker(robot)
+    raise unknown("collision engine", name, ("coal", "fcl", "none"))
 
 
 class CoalChecker(CollisionChecker):
-    """Coal, FCL's successor that Pinocchio ships, with a broad phase per thread."""
+    """Coal, FCL's successor that Pinocchio ships, one configuration at a time.
 
-    # Below this many configurations the threads cost more than they save.
-    _PARALLEL_FROM = 8
+    Its plainest broad phase is the fastest here: an arm has too few bodies for a tree of their boxes to pay.
+    """
 
     def __init__(self, robot: RobotModel) -> None:
         super().__init__(robot)
-        # For one configuration at a time: an arm has too few bodies for a tree of their boxes to pay.
-        self._data = robot.model.createData()
-        self._naive = pin.BroadPhaseManager_NaiveCollisionManager(
-            robot.model, robot.geometry, robot.geometry.createData()
-        )
-        # For many: the only broad phase that Pinocchio spreads over threads.
-        self._threads = available_cpus()
-        self._pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
-            robot.model, robot.geometry, self._threads
+        # The manager refers to what it is given, and does not keep it alive.
+        self._data, self._geometry_data = robot.model.createData(), robot.geometry.createData()
+        self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
+            robot.model, robot.geometry, self._geometry_data
         )
 
     def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        if len(q) < self._PARALLEL_FROM:
-            model, data, naive = self.robot.model, self._data, self._naive
-            return np.array([pin.computeCollisions(model, data, naive, row, True) for row in q])
+        model, data, manager, check = (
+            self.robot.model,
+            self._data,
+            self._manager,
+            pin.computeCollisions,
+        )
+        return np.array([check(model, data, manager, row, True) for row in q], dtype=np.bool_)
+
+
+class ParallelCoalChecker(CollisionChecker):
+    """Coal with a broad phase per thread.
+
+    Worth it for large batches on several idle cores: on a busy one the threads wait for each other, and a process that
+    has used them must not fork.
+    """
+
+    def __init__(self, robot: RobotModel, threads: int) -> None:
+        super().__init__(robot)
+        self._threads = threads
+        # The only broad phase that Pinocchio spreads over threads.
+        self._pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
+            robot.model, robot.geometry, threads
+        )
+
+    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         result = pin.computeCollisionsInParallel(self._threads, self._pool, q.T, True, False)
         return np.asarray(result, dtype=np.bool_).reshape(len(q))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.robot, self._threads)
 
-def available_cpus() -> int:
-    """The number of processors that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
-        return os.cpu_count() or 1
+
+class NoChecker(CollisionChecker):
+    """Sees no collision, and costs nothing."""
+
+    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.zeros(len(q), dtype=np.bool_)
