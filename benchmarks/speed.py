@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable
 from importlib.metadata import version
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -63,7 +64,7 @@ def single(env_id: str, seed: int = 0) -> Callable[[], int]:
     return run
 
 
-def batch(env_id: str, num_envs: int, **options: str) -> Callable[[], int]:
+def batch(env_id: str, num_envs: int, **options: Any) -> Callable[[], int]:
     """Steps of the native vector environment with random actions."""
     envs = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
     envs.reset(seed=0)

@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -59,7 +58,6 @@ class NothingVecEnv(VecEnv):
 
 def training_ratio(task: str = "MARACollisionOrient-v0") -> str:
     """Train both for 1M steps, slice by slice in turn, and say how the times compare."""
-    torch.set_num_threads(1)
     preset = presets.preset("ppo", task)
     ours = make_env(task, "pinocchio", preset.num_envs, {})
     models = [new_agent("ppo", preset, env, seed=0) for env in (ours, NothingVecEnv(ours))]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from gym_mara import regression
 from gym_mara.backends import backend_names
@@ -64,6 +65,9 @@ def train(
         Path | None,
         typer.Option(help="New run folder; by default one under runs/ named after run and time."),
     ] = None,
+    checkpoint_every: Annotated[
+        float, typer.Option(help="Steps between two checkpoints, each of which is evaluated.")
+    ] = 5e4,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     resume: Annotated[
         Path | None,
@@ -77,13 +81,21 @@ def train(
         from gym_mara.agents.train import train as begin
 
     if resume is not None:
-        with _progress(RunFolder.open(resume).config.steps) as report:
+        with _progress(RunFolder.open(resume).config.steps, resume) as report:
             run = go_on(resume, report)
     else:
-        config = RunConfig(_task(env), algo, backend, _whole(steps), seed, _options(settings))
+        config = RunConfig(
+            env=_task(env),
+            algo=algo,
+            backend=backend,
+            steps=_whole("--steps", steps),
+            seed=seed,
+            checkpoint_every=_whole("--checkpoint-every", checkpoint_every),
+            env_options=_options(settings),
+        )
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         folder = out or Path("runs") / f"{algo}_{config.env}_{backend}_seed{seed}_{stamp}"
-        with _progress(config.steps) as report:
+        with _progress(config.steps, folder) as report:
             run = begin(config, folder, report)
     _print_evaluation(run, episodes=1)
     _out.print(f"Run folder: {run.path}", soft_wrap=True)
@@ -117,7 +129,8 @@ def evaluate(
 @app.command("list")
 def list_() -> None:
     """Show the environments, the backends and the robots."""
-    table = Table("environment", "reward uses", "on a collision", title="Environments")
+    columns = Column("environment", no_wrap=True), "reward uses", "on a collision"
+    table = Table(*columns, title="Environments")
     for name, task in TASKS.items():
         uses = ["distance"]
         uses += ["orientation"] if getattr(task, "orientation", False) else []
@@ -165,7 +178,9 @@ def main() -> None:
     try:
         app()
     except GymMaraError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+        # A Text, not a string: an extra's brackets are no markup.
+        text = Text.assemble(("error: ", "bold red"), str(error))
+        Console(stderr=True).print(text, soft_wrap=True)
         sys.exit(2)
 
 
@@ -180,8 +195,8 @@ def _agents() -> Iterator[None]:
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[Any]:
-    """A bar of progress, as the function that a training reports to."""
+def _progress(total: int, run: Path) -> Iterator[Any]:
+    """A bar of progress, as the function that a training reports to; an interrupt says how to go on."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -190,7 +205,11 @@ def _progress(total: int) -> Iterator[Any]:
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
-    with Progress(*columns, console=_out) as bar:
+    interrupted = (
+        f"Interrupted. What was trained up to the last checkpoint is kept; go on with\n"
+        f"gym-mara train --resume {run}"
+    )
+    with _interruptible(interrupted), Progress(*columns, console=_out) as bar:
         task = bar.add_task("", total=total)
 
         def report(steps: int, shown: dict[str, float]) -> None:
@@ -200,6 +219,15 @@ def _progress(total: int) -> Iterator[Any]:
             bar.update(task, completed=min(steps, total), description=text)
 
         yield report
+
+
+@contextmanager
+def _interruptible(message: str) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        _out.print(message, soft_wrap=True)
+        raise typer.Exit(130) from None
 
 
 def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
@@ -225,10 +253,10 @@ def _task(env: str) -> str:
     return name
 
 
-def _whole(steps: float) -> int:
-    if steps != int(steps) or steps < 1:
-        raise GymMaraError(f"--steps must be a whole number of at least 1, not {steps:g}")
-    return int(steps)
+def _whole(option: str, value: float) -> int:
+    if not (value >= 1 and value == value // 1):
+        raise GymMaraError(f"{option} must be a whole number of at least 1, not {value:g}")
+    return int(value)
 
 
 def _options(settings: list[str]) -> dict[str, Any]:
@@ -243,3 +271,7 @@ def _options(settings: list[str]) -> dict[str, Any]:
         except ValueError:
             options[name] = value
     return options
+
+
+if __name__ == "__main__":
+    main()

@@ -105,7 +105,7 @@ class Simulation:
         reward, info = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
-        if self.task.on_collision != "continue" and collided.any():
+        if self.task.on_collision != "continue" and np.count_nonzero(collided):
             if self.task.on_collision == "reset":
                 self.backend.reset(self._start, collided)
             else:
@@ -124,7 +124,7 @@ class Simulation:
                 f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
                 f"{self.robot.name} wants {self._start.shape[1:] if self.num_envs == 1 else self._start.shape}"
             )
-        if not np.isfinite(target).all():
+        if np.count_nonzero(np.isfinite(target)) < target.size:
             raise GymMaraError(
                 "the action holds NaN or infinity; joint targets must be finite (rad)"
             )

@@ -28,29 +28,27 @@ class Keeper(BaseCallback):
 
     Args:
         run: where to write.
-        every: how many steps lie between two checkpoints; each is evaluated.
         best: the best evaluation so far, as reward per step.
         report: called after every update with the number of steps and what to show.
     """
 
-    def __init__(self, run: RunFolder, every: int, best: float, report: Report) -> None:
+    def __init__(self, run: RunFolder, best: float, report: Report) -> None:
         super().__init__()
         self.run = run
-        self.every = every
         self.best = best
         self.report = report
         self.shown: dict[str, float] = {}
         self._next = 0
 
     def _on_training_start(self) -> None:
-        self._next = self.num_timesteps + self.every
+        self._next = self.num_timesteps + self.run.config.checkpoint_every
         config = self.run.config
         self._eval_env = make_env(config.env, config.backend, 1, config.env_options)
 
     def _on_rollout_start(self) -> None:
         # The model's own count: the callback's is set later in the rollout.
         if self.model.num_timesteps >= self._next:
-            self._next = self.model.num_timesteps + self.every
+            self._next = self.model.num_timesteps + self.run.config.checkpoint_every
             self.checkpoint()
 
     def _on_step(self) -> bool:
@@ -76,6 +74,7 @@ class Keeper(BaseCallback):
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[name] = value
+        self.logger.record("time/total_timesteps", steps)
         self.logger.dump(steps)
         if self.shown["eval_reward_per_step"] > self.best:
             self.best = self.shown["eval_reward_per_step"]
@@ -83,6 +82,7 @@ class Keeper(BaseCallback):
         state = {
             "best": self.best,
             "env": base_env(model).save_state(),
+            "returns": normalisation(model).returns,
             "random": random_state(),
         }
         folder = self.run.path / "checkpoints" / str(steps)

@@ -23,7 +23,7 @@ def plot_learning_curve(run: RunFolder) -> Path:
     draw(reward, "eval/eval_reward_per_step", "deterministic policy", "C1o-")
     reward.axhline(10.0, color="grey", linewidth=0.8, linestyle=":")
     reward.set_ylabel("reward per step")
-    reward.legend(loc="lower right")
+    reward.legend(loc="best")
     draw(error, "eval/position_error_mm", "deterministic policy, last step", "C1o-")
     error.set_yscale("log")
     error.set_ylabel("position error, mm")

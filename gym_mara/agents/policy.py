@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import zipfile
 from pathlib import Path
@@ -14,6 +15,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from gym_mara.agents.run import replace_folder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.errors import GymMaraError, unknown
+
+# What reading a pickle or a zip that was cut short or overwritten raises.
+DAMAGE = (OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, pickle.UnpicklingError)
 
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO}
 
@@ -59,7 +63,7 @@ def load_policy(
         )
     except GymMaraError:
         raise
-    except (OSError, EOFError, zipfile.BadZipFile, AttributeError, KeyError) as error:
+    except DAMAGE as error:
         raise GymMaraError(f"the policy in {str(folder)!r} is damaged: {error}") from error
     except (ValueError, AssertionError) as error:
         raise GymMaraError(

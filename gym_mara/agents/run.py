@@ -20,8 +20,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, unknown
 
+POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "torch")
 
 
@@ -34,6 +35,8 @@ class RunConfig:
     backend: str
     steps: int
     seed: int
+    checkpoint_every: int = 50_000
+    """How many steps lie between two checkpoints; each is evaluated."""
     env_options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment besides `backend`."""
     preset: dict[str, Any] = field(default_factory=dict)
@@ -99,6 +102,10 @@ class RunFolder:
         found = [p for p in folder.glob("*") if p.name.isdigit()] if folder.is_dir() else []
         return sorted(found, key=lambda p: int(p.name))
 
+    def has_policy(self, which: str) -> bool:
+        """Whether the run has left the policy "last" or "best"."""
+        return (self.path / which / "model.zip").is_file()
+
     def policy(self, which: str) -> Path:
         """The folder of the policy "last" or "best".
 
@@ -106,7 +113,9 @@ class RunFolder:
             GymMaraError: the run has none yet.
         """
         folder = self.path / which
-        if not (folder / "model.zip").is_file():
+        if which not in POLICIES:
+            raise unknown("policy", which, POLICIES)
+        if not self.has_policy(which):
             raise GymMaraError(
                 f"the run {str(self.path)!r} has no {which!r} policy: it has not finished; go on with --resume"
             )
@@ -138,4 +147,8 @@ def read_progress(file: Path) -> list[dict[str, float]]:
     with file.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     complete = [row for row in rows if row.get("time/total_timesteps")]
-    return [{k: float(v) for k, v in row.items() if k and v} for row in complete]
+    return [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
+
+
+def _number(text: str) -> float:
+    return int(text) if text.isdigit() else float(text)

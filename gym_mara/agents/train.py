@@ -23,11 +23,9 @@ from gym_mara.agents import presets
 from gym_mara.agents.callbacks import Keeper, Report, base_env, restore_random_state
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import algorithm_class, load_policy
+from gym_mara.agents.policy import DAMAGE, algorithm_class, load_policy
 from gym_mara.agents.run import RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError
-
-CHECKPOINT_EVERY = 50_000
 
 
 def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
@@ -36,8 +34,9 @@ def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
     Raises:
         GymMaraError: a name is unknown, a value out of range, or the folder exists.
     """
-    if config.steps < 1:
-        raise GymMaraError(f"steps must be at least 1, not {config.steps}")
+    for name in ("steps", "checkpoint_every"):
+        if getattr(config, name) < 1:
+            raise GymMaraError(f"{name} must be at least 1, not {getattr(config, name)}")
     preset = presets.preset(config.algo, config.env)
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
     model = new_model(config)  # before the folder: what cannot be built leaves none behind
@@ -56,16 +55,18 @@ def resume(path: Path, report: Report) -> RunFolder:
     checkpoints = run.checkpoints()
     if not checkpoints:
         return _learn(run, new_model(config), best=-np.inf, report=report)
+    use_one_thread()
     preset = presets.Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
-    model, _ = load_policy(checkpoints[-1], config.algo, env, training=True)
-    if model.num_timesteps >= config.steps:
+    model, wrapped = load_policy(checkpoints[-1], config.algo, env, training=True)
+    if model.num_timesteps >= config.steps and run.has_policy("last"):
         raise GymMaraError(f"the run {str(path)!r} has finished its {config.steps} steps")
     try:
         state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
         env.restore_state(state["env"])
+        wrapped.returns = state["returns"]
         restore_random_state(state["random"])
-    except (OSError, EOFError, pickle.UnpicklingError, KeyError) as error:
+    except DAMAGE as error:
         raise GymMaraError(
             f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
         ) from error
@@ -81,11 +82,17 @@ def new_model(config: RunConfig) -> OnPolicyAlgorithm:
 
 def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
     """An untrained agent of an algorithm and a preset on any environment of Stable-Baselines3."""
+    use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     return algorithm_class(algo)("MlpPolicy", wrapped, seed=seed, device="cpu", **arguments)
+
+
+def use_one_thread() -> None:
+    """Keep torch to one thread: for networks this small more cost time, and change the last bits of the result."""
+    torch.set_num_threads(1)
 
 
 def _schedule(value: Any) -> Any:
@@ -106,19 +113,17 @@ class LinearSchedule:
 
 
 def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
-    # The networks are small: a second thread costs more than it brings.
-    torch.set_num_threads(1)
     model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
-    keeper = Keeper(run, CHECKPOINT_EVERY, best, report)
     report(model.num_timesteps, {})
-    model.learn(
-        run.config.steps - model.num_timesteps,
-        callback=keeper,
-        reset_num_timesteps=False,
-        log_interval=1,
-    )
-    model.logger.close()
-    base_env(model).close()
+    try:
+        model.learn(
+            run.config.steps - model.num_timesteps,
+            callback=Keeper(run, best, report),
+            reset_num_timesteps=False,
+        )
+    finally:  # an interrupt among the ways out
+        model.logger.close()
+        base_env(model).close()
     plot_learning_curve(run)
     return run
 

@@ -64,10 +64,10 @@ class PinocchioBackend(Backend):
         self._collided: NDArray[np.bool_] | None = None
 
     def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
-        chosen = slice(None) if mask is None else mask
-        self._q[chosen] = q[chosen]
-        self._qd[chosen] = 0.0
-        self._time[chosen] = 0.0
+        rows = True if mask is None else mask[:, None]
+        np.copyto(self._q, q, where=rows)
+        np.copyto(self._qd, 0.0, where=rows)
+        np.copyto(self._time, 0.0, where=True if mask is None else mask)
         self._collided = None
 
     def step(self, q_target: Floats) -> SimState:

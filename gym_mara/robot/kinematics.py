@@ -70,12 +70,14 @@ class Kinematics:
         return product[:, :3, 3].copy(), rotations.from_matrix(product[:, :3, :3])
 
     def _pose_one_by_one(self, q: Floats) -> tuple[Floats, Floats]:
-        poses = np.empty((len(q), 7))
-        for row, configuration in enumerate(q):
+        positions, quaternions = [], []
+        for configuration in q:
             pin.forwardKinematics(self._model, self._data, configuration)
             placement = pin.updateFramePlacement(self._model, self._data, self._frame)
-            poses[row] = pin.SE3ToXYZQUAT(placement)
-        return poses[:, :3], rotations.canonical(poses[:, [6, 3, 4, 5]])
+            *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
+            positions.append(position)
+            quaternions.append((w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z))
+        return np.array(positions), np.array(quaternions)
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""

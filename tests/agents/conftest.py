@@ -1,0 +1,36 @@
+"""A small training that several tests look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gym_mara.agents.run import RunConfig, RunFolder
+from gym_mara.agents.train import train
+
+ROLLOUT = 256 * 16
+"""Steps between two updates of the preset."""
+
+
+def config(**changes: object) -> RunConfig:
+    """A run of three updates with a checkpoint after each."""
+    values: dict[str, object] = {
+        "env": "MARACollisionOrient-v0",
+        "algo": "ppo",
+        "backend": "pinocchio",
+        "steps": 3 * ROLLOUT,
+        "seed": 5,
+        "checkpoint_every": ROLLOUT,
+    }
+    return RunConfig(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def silent(steps: int, shown: dict[str, float]) -> None:
+    """No progress is reported."""
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that was trained to its end; tests must not change it."""
+    return train(config(), Path(tmp_path_factory.mktemp("runs")) / "run", silent)

@@ -1,0 +1,107 @@
+"""The view of the environments that Stable-Baselines3 has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+
+from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.envs import MaraVectorEnv
+from gym_mara.errors import GymMaraError
+
+
+def step(env: MaraVecEnv, action: NDArray[np.float32]) -> tuple[Any, Any, Any, Any]:
+    """One step; Stable-Baselines3's type allows dicts of observations too."""
+    return env.step(action)
+
+
+def small(num_envs: int = 3, **options: Any) -> MaraVecEnv:
+    """Arms with episodes of four steps."""
+    return make_env("MARAOrient-v0", "pinocchio", num_envs, options, max_episode_steps=4)
+
+
+def test_actions_span_each_joint_s_range() -> None:
+    env = small()
+    env.reset()
+    robot = env.env.simulation.robot
+    for value, limit in (
+        (-1.0, robot.lower),
+        (1.0, robot.upper),
+        (0.0, 0.5 * (robot.lower + robot.upper)),
+    ):
+        observation, *_ = step(env, np.full((3, 6), value, np.float32))
+        np.testing.assert_allclose(
+            observation[:, :6],
+            np.tile(np.clip(limit, -np.float32(np.pi), np.float32(np.pi)), (3, 1)),
+        )
+
+
+def test_the_last_step_of_an_episode_tells_all() -> None:
+    env = small()
+    start: Any = env.reset()
+    rewards = np.zeros(3)
+    for number in range(4):
+        before = rewards.copy()
+        observation, reward, done, infos = step(env, np.full((3, 6), 0.1 * number, np.float32))
+        rewards = before + reward
+        assert done.tolist() == [number == 3] * 3
+    np.testing.assert_array_equal(observation, start)
+    for index, info in enumerate(infos):
+        assert info["TimeLimit.truncated"] is True
+        assert info["terminal_observation"].shape == observation[0].shape
+        assert not np.array_equal(info["terminal_observation"], observation[index])
+        assert info["episode"]["l"] == 4
+        assert info["episode"]["r"] == pytest.approx(rewards[index], abs=1e-5)
+        assert {"position_error", "angle_error", "num_coll", "ep_dist_min"} <= info.keys()
+
+
+def test_a_collision_that_ends_the_episode_is_no_truncation() -> None:
+    env = small(num_envs=1, on_collision="terminate")
+    env.reset()
+    _, _, done, infos = step(env, np.array([[0.0, 1.0, 0.5, 0.0, 0.0, 0.0]], np.float32))
+    assert done[0]
+    assert infos[0]["collided"] is True
+    assert infos[0]["TimeLimit.truncated"] is False
+
+
+def test_it_goes_on_from_a_snapshot() -> None:
+    env, action = small(), np.full((3, 6), 0.2, np.float32)
+    env.reset()
+    step(env, action)
+    snapshot = env.save_state()
+    first = [step(env, action) for _ in range(4)]
+    env.restore_state(snapshot)
+    for expected in first:
+        again = step(env, action)
+        np.testing.assert_array_equal(again[0], expected[0])
+        np.testing.assert_array_equal(again[2], expected[2])
+    assert (
+        first[2][3][0]["episode"]["r"] == again[3][0].get("episode", first[2][3][0]["episode"])["r"]
+    )
+
+
+def test_any_algorithm_of_stable_baselines3_trains_on_it() -> None:
+    model = PPO("MlpPolicy", small(), n_steps=8, batch_size=8, device="cpu")
+    model.learn(48)
+    assert model.ep_info_buffer
+    assert model.ep_info_buffer[0]["l"] == 4
+
+
+def test_it_wants_episodes_reset_in_the_same_step() -> None:
+    with pytest.raises(GymMaraError, match="SameStep"):
+        MaraVecEnv(MaraVectorEnv(2))
+
+
+def test_attributes_and_methods_reach_the_environment() -> None:
+    env = small()
+    assert env.get_attr("max_episode_steps", [0, 2]) == [4, 4]
+    assert len(env.env_method("save_state")) == 3
+    assert env.env_is_wrapped(object) == [False] * 3
+    env.seed(3)
+    env.reset()
+    env.close()

@@ -1,0 +1,249 @@
+"""Training: what a run leaves behind, and that it goes on after a cut as if there had been none."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gym_mara.agents.evaluate import METRICS, evaluate_run, make_env, spread
+from gym_mara.agents.policy import load_policy
+from gym_mara.agents.run import RunFolder, read_progress
+from gym_mara.agents.train import resume, train
+from gym_mara.errors import GymMaraError
+from tests.agents.conftest import ROLLOUT, config, silent
+
+
+def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
+    """The weights of a run's policy."""
+    env = make_env(run.config.env, run.config.backend, 1, {})
+    model, _ = load_policy(run.path / which, run.config.algo, env, training=False)
+    return dict(model.policy.state_dict())
+
+
+def assert_same_training(run: RunFolder, other: RunFolder) -> None:
+    """The two runs learnt the same, to the bit, and logged the same but for the clock."""
+    mine, theirs = parameters(run), parameters(other)
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    tables = []
+    for folder in (run, other):
+        rows = read_progress(folder.progress_file)
+        clock = ("time/fps", "time/time_elapsed", "time/iterations")
+        tables.append([{k: v for k, v in row.items() if k not in clock} for row in rows])
+    assert tables[0] == tables[1]
+
+
+def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
+    path = finished_run.path
+    about = json.loads((path / "config.json").read_text())
+    assert about["seed"] == 5
+    assert about["preset"]["arguments"]["n_steps"] == 16
+    assert {"gym_mara", "gymnasium", "torch", "pin", "python"} <= about["versions"].keys()
+    assert [int(p.name) for p in finished_run.checkpoints()] == [ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    for folder in (path / "best", path / "last", *finished_run.checkpoints()):
+        assert (folder / "model.zip").is_file()
+        assert (folder / "normalisation.pkl").is_file()
+    assert list((path / "tensorboard").glob("events*"))
+    assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    rows = read_progress(finished_run.progress_file)
+    assert [r["eval/position_error_mm"] > 0 for r in rows if "eval/position_error_mm" in r]
+    assert {r["time/total_timesteps"] for r in rows} == {ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT}
+
+
+def test_the_same_seed_trains_the_same_policy(finished_run: RunFolder, tmp_path: Path) -> None:
+    again = train(config(), tmp_path / "run", silent)
+    assert_same_training(finished_run, again)
+
+
+def test_another_seed_trains_another_policy(finished_run: RunFolder, tmp_path: Path) -> None:
+    other = train(config(seed=6, steps=ROLLOUT), tmp_path / "run", silent)
+    mine, theirs = parameters(finished_run), parameters(other)
+    assert not all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+@pytest.mark.parametrize("updates_before_the_cut", [1, 2])
+def test_a_cut_off_run_goes_on_as_if_it_had_not_been(
+    finished_run: RunFolder, tmp_path: Path, updates_before_the_cut: int
+) -> None:
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        # Reported at the end of a rollout: the update that follows is lost, its steps are not in a checkpoint.
+        if steps > updates_before_the_cut * ROLLOUT:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config(), tmp_path / "run", cut)
+    resumed = resume(tmp_path / "run", silent)
+    assert_same_training(finished_run, resumed)
+
+
+def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
+    process = subprocess.Popen(
+        [*command, "--checkpoint-every", str(ROLLOUT)], stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 120
+    while not (run / "checkpoints" / str(2 * ROLLOUT)).is_dir():
+        assert process.poll() is None, "the training ended early"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    reached = int(RunFolder.open(run).checkpoints()[-1].name)
+    text = (run / "config.json").read_text()
+    (run / "config.json").write_text(text.replace("10000000", str(reached + ROLLOUT)))
+    seen: list[int] = []
+    resumed = resume(run, lambda steps, shown: seen.append(steps))
+    assert seen[0] == reached
+    assert resumed.has_policy("last")
+
+
+def test_a_run_cut_off_before_its_first_checkpoint_begins_anew(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        if steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config(), tmp_path / "run", cut)
+    assert_same_training(finished_run, resume(tmp_path / "run", silent))
+
+
+def test_a_run_cut_off_after_its_last_checkpoint_is_finished(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    shutil.copytree(finished_run.path, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "last")
+    assert_same_training_but_log(finished_run, resume(tmp_path / "run", silent))
+
+
+def assert_same_training_but_log(run: RunFolder, other: RunFolder) -> None:
+    """The two runs ended with the same policy."""
+    mine, theirs = parameters(run), parameters(other)
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+def test_a_finished_run_is_not_resumed(finished_run: RunFolder) -> None:
+    with pytest.raises(GymMaraError, match="has finished"):
+        resume(finished_run.path, silent)
+
+
+def test_a_folder_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(GymMaraError, match="not overwritten"):
+        train(config(), tmp_path, silent)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algo": "pop"}, "unknown algorithm 'pop'. Did you mean 'ppo'"),
+        ({"env": "MARA-v9"}, "unknown task 'MARA-v9'.*MARACollision-v0"),
+        ({"backend": "gazebo"}, "unknown backend 'gazebo'.*pinocchio"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
+        ({"env_options": {"colour": "red"}}, "unknown keyword argument 'colour'"),
+    ],
+)
+def test_a_wrong_configuration_leaves_no_folder(
+    tmp_path: Path, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        train(config(**changes), tmp_path / "run", silent)
+    assert not (tmp_path / "run").exists()
+
+
+def test_evaluation_reports_each_metric_of_each_episode(finished_run: RunFolder) -> None:
+    metrics = evaluate_run(finished_run, episodes=3)
+    assert tuple(metrics) == METRICS
+    assert all(values.shape == (3,) for values in metrics.values())
+    # Start pose and policy are the same in every episode, and so is what comes of them.
+    assert all(np.ptp(values) == 0.0 for values in metrics.values())
+    np.testing.assert_allclose(metrics["return"], 2048 * metrics["reward_per_step"], rtol=1e-9)
+    summary = spread(metrics)
+    assert summary["return"].keys() == {"mean", "std", "min", "max"}
+
+
+def test_evaluation_plays_what_the_policy_was_trained_for(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    options = {"max_joint_velocity": 1.0, "start_q": [0.1] * 6}
+    run = train(config(steps=ROLLOUT, env_options=options), tmp_path / "run", silent)
+    assert RunFolder.open(run.path).config.env_options == options
+    assert (
+        evaluate_run(run, episodes=1)["return"] != evaluate_run(finished_run, episodes=1)["return"]
+    )
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_evaluation_wants_an_episode(finished_run: RunFolder, episodes: int) -> None:
+    with pytest.raises(GymMaraError, match="episodes must be at least 1"):
+        evaluate_run(finished_run, episodes=episodes)
+
+
+def copy_of(run: RunFolder, path: Path) -> RunFolder:
+    """A run that a test may damage."""
+    shutil.copytree(run.path, path)
+    return RunFolder.open(path)
+
+
+@pytest.mark.parametrize("file", ["model.zip", "normalisation.pkl"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut"])
+def test_a_damaged_policy_is_named(
+    finished_run: RunFolder, tmp_path: Path, file: str, damage: str
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    victim = run.path / "last" / file
+    content = victim.read_bytes()
+    victim.unlink()
+    if damage != "missing":
+        victim.write_bytes(content[: 0 if damage == "empty" else len(content) // 2])
+    with pytest.raises(GymMaraError, match="run"):
+        evaluate_run(run)
+
+
+def test_a_damaged_checkpoint_is_named(finished_run: RunFolder, tmp_path: Path) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    (run.checkpoints()[-1] / "state.pkl").write_bytes(b"")
+    with pytest.raises(GymMaraError, match=r"damaged.*go on from the one before"):
+        resume(run.path, silent)
+
+
+def test_a_policy_of_another_environment_is_refused(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    file = run.path / "config.json"
+    file.write_text(file.read_text().replace("MARACollisionOrient-v0", "MARA-v0"))
+    with pytest.raises(GymMaraError, match="does not fit the environment"):
+        evaluate_run(RunFolder.open(run.path))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"env": "MARA-v0", "versions": {}}'])
+def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(GymMaraError, match="damaged"):
+        RunFolder.open(tmp_path)
+
+
+def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(GymMaraError, match="no run folder"):
+        RunFolder.open(tmp_path)
+
+
+def test_an_unfinished_run_has_no_last_policy(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    run = RunFolder(tmp_path / "run", config())
+    with pytest.raises(GymMaraError, match="has no 'last' policy"):
+        evaluate_run(run)
