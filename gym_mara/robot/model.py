@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import catalog
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
+from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain
 
 Floats = NDArray[np.float64]
 
@@ -93,9 +93,9 @@ class RobotModel:
         urdf, srdf = Path(urdf), None if srdf is None else Path(srdf)
         root = read_xml(urdf, "URDF")
         semantics = read_srdf(srdf) if srdf else Semantics()
-        ee_frame = _checked_ee_frame(urdf, root, ee_frame or semantics.end_effector)
-        chain = _to_chain(urdf, root, ee_frame)
-        model, geometry = _build(urdf, ElementTree.tostring(root, encoding="unicode"))
+        ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
+        chain = make_chain(urdf, root, ee_frame)
+        model, geometry = build(urdf, ElementTree.tostring(root, encoding="unicode"))
         home = _home(semantics, chain, model)
         robot = cls(
             name=name or root.get("name") or urdf.stem,
@@ -205,77 +205,6 @@ def _read_only(values: Floats) -> Floats:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
-
-
-def _checked_ee_frame(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
-    links = [link.get("name", "") for link in root.iter("link")]
-    if ee_frame is None:
-        raise GymMaraError(
-            f"name the end-effector link of {str(urdf)!r} (ee_frame=…), one of: {', '.join(links)}"
-        )
-    if ee_frame not in links:
-        raise GymMaraError(
-            f"{str(urdf)!r} has no link {ee_frame!r} to be the end-effector frame; it has: {', '.join(links)}"
-        )
-    return ee_frame
-
-
-def _to_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str]:
-    """Make the URDF one chain of single-position joints to the end-effector frame, and return their names.
-
-    Joints off the chain become fixed; continuous joints turn between -π and π.
-    """
-    joints = {}
-    for joint in root.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
-        if parent is None or child is None:
-            raise GymMaraError(
-                f"{str(urdf)!r}: joint {joint.get('name')!r} lacks a parent or child"
-            )
-        joints[child.get("link")] = (joint, parent.get("link"))
-    chain: list[str] = []
-    link: str | None = ee_frame
-    while link in joints:
-        joint, link = joints.pop(link)
-        kind = "mimic" if joint.find("mimic") is not None else joint.get("type")
-        if kind == "continuous":
-            _make_revolute(joint)
-        elif kind not in ("revolute", "prismatic", "fixed"):
-            raise GymMaraError(
-                f"{str(urdf)!r} is not a fixed-base chain to {ee_frame!r}: joint {joint.get('name')!r} "
-                f"is {kind}; only revolute, continuous, prismatic and fixed joints may lead there"
-            )
-        if kind != "fixed":
-            chain.insert(0, joint.get("name", ""))
-    if not chain:
-        raise GymMaraError(f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; it is no arm")
-    for joint, _ in joints.values():
-        joint.set("type", "fixed")
-    return chain
-
-
-def _make_revolute(joint: ElementTree.Element) -> None:
-    joint.set("type", "revolute")
-    limit = joint.find("limit")
-    if limit is None:
-        limit = ElementTree.SubElement(joint, "limit", effort="inf", velocity="inf")
-    limit.set("lower", repr(-np.pi))
-    limit.set("upper", repr(np.pi))
-
-
-def _build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
-    """Pinocchio's model of a URDF's text and its collision geometry."""
-    # Catalogues name meshes package://…; a package may be any folder above the URDF.
-    ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
-    folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
-    try:
-        model = pin.buildModelFromXML(text)
-        geometry = pin.buildGeomFromUrdfString(
-            model, text, pin.GeometryType.COLLISION, package_dirs=folders
-        )
-    except (ValueError, RuntimeError) as error:
-        raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {error}") from error
-    return model, geometry
 
 
 def _home(semantics: Semantics, chain: list[str], model: pin.Model) -> Floats:

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
     """The configuration (J,), rad, within the limits, that comes closest to a pose; collisions do not count.
 
-    Damped least squares (Nakamura and Hanafusa 1986) from the home pose and from fixed random configurations.
+    Levenberg and Marquardt's method, projected onto the limits, from the home pose and fixed random configurations.
 
     Args:
         robot: the arm.
@@ -35,20 +35,28 @@ def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> 
         turn = pin.log3(target.rotation @ here.rotation.T)
         return np.concatenate([target.translation - here.translation, turn])[rows]
 
+    def step(q: Floats, off: Floats, damping: float) -> Floats:
+        jacobian = pin.computeFrameJacobian(
+            robot.model, data, q, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
+        )[rows]
+        normal = jacobian.T @ jacobian + damping * np.eye(robot.num_joints)
+        return np.clip(q + np.linalg.solve(normal, jacobian.T @ off), robot.lower, robot.upper)
+
     best, best_error = robot.home.copy(), np.inf
     for start in [robot.home, *rng.uniform(low, high, (20, robot.num_joints))]:
-        q = np.array(start)
-        for _ in range(100):
-            off = error(q)
-            if np.linalg.norm(off) < best_error:
-                best, best_error = q.copy(), float(np.linalg.norm(off))
-            if best_error < 1e-9:
-                return best
-            jacobian = pin.computeFrameJacobian(
-                robot.model, data, q, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
-            )[rows]
-            damped = jacobian @ jacobian.T + 1e-4 * (off @ off + 1e-6) * np.eye(len(off))
-            q = np.clip(q + jacobian.T @ np.linalg.solve(damped, off), robot.lower, robot.upper)
+        q, damping = np.array(start), 1e-2
+        off = error(q)
+        for _ in range(60):
+            candidate = step(q, off, damping)
+            there = error(candidate)
+            if there @ there < off @ off:
+                q, off, damping = candidate, there, max(damping / 4.0, 1e-12)
+            else:
+                damping *= 8.0
+        if np.linalg.norm(off) < best_error:
+            best, best_error = q, float(np.linalg.norm(off))
+        if best_error < 1e-9:
+            break
     return best
 
 

@@ -1,0 +1,95 @@
+"""Reading a URDF as one chain of joints, and building Pinocchio's model of it."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from gym_mara.errors import GymMaraError
+
+
+def ee_frame_among_links(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
+    """The end-effector frame, if the URDF has a link of that name.
+
+    Raises:
+        GymMaraError: it has not, or no frame is named.
+    """
+    links = [link.get("name", "") for link in root.iter("link")]
+    if ee_frame is None:
+        raise GymMaraError(
+            f"name the end-effector link of {str(urdf)!r} (ee_frame=…), one of: {', '.join(links)}"
+        )
+    if ee_frame not in links:
+        raise GymMaraError(
+            f"{str(urdf)!r} has no link {ee_frame!r} to be the end-effector frame; it has: {', '.join(links)}"
+        )
+    return ee_frame
+
+
+def make_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str]:
+    """Make the URDF one chain of single-position joints to the end-effector frame, and return their names.
+
+    Joints off the chain become fixed; continuous joints turn between -π and π.
+
+    Raises:
+        GymMaraError: no moving joint leads to the frame, or one of another kind does.
+    """
+    joints = {}
+    for joint in root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is None or child is None:
+            raise GymMaraError(
+                f"{str(urdf)!r}: joint {joint.get('name')!r} lacks a parent or child"
+            )
+        joints[child.get("link")] = (joint, parent.get("link"))
+    chain: list[str] = []
+    link: str | None = ee_frame
+    while link in joints:
+        joint, link = joints.pop(link)
+        kind = "mimic" if joint.find("mimic") is not None else joint.get("type")
+        if kind == "continuous":
+            _make_revolute(joint)
+        elif kind not in ("revolute", "prismatic", "fixed"):
+            raise GymMaraError(
+                f"{str(urdf)!r} is not a fixed-base chain to {ee_frame!r}: joint {joint.get('name')!r} "
+                f"is {kind}; only revolute, continuous, prismatic and fixed joints may lead there"
+            )
+        if kind != "fixed":
+            chain.insert(0, joint.get("name", ""))
+    if not chain:
+        raise GymMaraError(f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; it is no arm")
+    for joint, _ in joints.values():
+        joint.set("type", "fixed")
+    return chain
+
+
+def _make_revolute(joint: ElementTree.Element) -> None:
+    joint.set("type", "revolute")
+    limit = joint.find("limit")
+    if limit is None:
+        limit = ElementTree.SubElement(joint, "limit", effort="inf", velocity="inf")
+    limit.set("lower", repr(-np.pi))
+    limit.set("upper", repr(np.pi))
+
+
+def build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
+    """Pinocchio's model of a URDF's text and its collision geometry.
+
+    Raises:
+        GymMaraError: Pinocchio does not take it, or a mesh is not found.
+    """
+    # Catalogues name meshes package://…; a package may be any folder above the URDF.
+    ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
+    folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
+    try:
+        model = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(
+            model, text, pin.GeometryType.COLLISION, package_dirs=folders
+        )
+    except (ValueError, RuntimeError) as error:
+        raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {error}") from error
+    return model, geometry
