@@ -24,7 +24,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     """One arm.
 
     The observation is the task's, (O,); the action holds absolute joint targets (J,), rad. `info` carries the terms of
-    the reward and `collided`, and at the end of an episode `statistics`.
+    the reward, `collided`, and `statistics`, those of the episode so far (`gym_mara.statistics`).
 
     Args:
         task: the name of a task, such as "MARA-v0", or a Task.
@@ -74,15 +74,10 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         """
         outcome = self.simulation.step(np.asarray(action)[None])
         info: dict[str, Any] = {name: values.item() for name, values in outcome.info.items()}
-        terminated = bool(outcome.terminated[0])
-        if terminated or self.simulation.statistics.steps[0] == self._max_episode_steps():
-            summary = self.simulation.statistics.summary()
-            info["statistics"] = {name: values.item() for name, values in summary.items()}
+        # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
+        info["statistics"] = self.simulation.statistics.of(0)
+        terminated = outcome.terminated.item()
         return outcome.observation[0], outcome.reward.item(), terminated, False, info
-
-    def _max_episode_steps(self) -> int | None:
-        """When Gymnasium's TimeLimit, which `gymnasium.make` wraps around, ends the episode."""
-        return self.spec.max_episode_steps if self.spec else None
 
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arm, the episode and the random generator; it pickles."""
@@ -100,6 +95,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     """N arms in one batch: the numbers of N MaraEnvs, at a fraction of the time.
+
+    `info` is MaraEnv's in Gymnasium's form for vectors, with `statistics` at the last step of an episode.
 
     Args:
         num_envs: N.

@@ -12,7 +12,7 @@ import pytest
 def check_rewards() -> Callable[..., None]:
     """Fails a test where the rewards are not what a record says: `check_rewards(file, backend=…, tolerance=…)`.
 
-    Write the record with `gym-mara rewards ENV --record FILE`.
+    Write the record with `gym-mara rewards --env ENV --record FILE`.
     """
     # Imported here: pytest loads this module wherever gym_mara is installed.
     from gym_mara import regression

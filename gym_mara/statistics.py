@@ -11,42 +11,69 @@ Floats = NDArray[np.float64]
 
 
 class EpisodeStatistics:
-    """Largest, mean and smallest distance and reward, and the number of collisions, of N running episodes."""
+    """Largest, mean and smallest distance and reward, and the number of collisions, of N running episodes.
+
+    The names are gym-gazebo2's; its distance is the root mean square over x, y and z, m.
+    """
+
+    NAMES = (
+        "ep_dist_max",
+        "ep_rew_max",
+        "ep_dist_min",
+        "ep_rew_min",
+        "ep_dist_mean",
+        "ep_rew_mean",
+        "ep_steps",
+        "num_coll",
+    )
 
     def __init__(self, num_envs: int) -> None:
-        self.steps = np.zeros(num_envs, dtype=np.int64)
-        self._collisions = np.zeros(num_envs, dtype=np.int64)
-        # Rows: distance and reward.
-        self._max = np.full((2, num_envs), -np.inf)
-        self._min = np.full((2, num_envs), np.inf)
-        self._sum = np.zeros((2, num_envs))
+        # A row a name; the rows of means hold sums.
+        self._values = np.zeros((len(self.NAMES), num_envs))
+        self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:6]
+        self.clear(slice(None))
+
+    @property
+    def steps(self) -> Floats:
+        """The number of steps of each episode so far (N,)."""
+        return self._values[6]
 
     def add(self, distance: Floats, reward: Floats, collided: NDArray[np.bool_]) -> None:
         """Count one step of every episode; all arrays (N,), distance in m."""
         values = np.array((distance, reward))
-        self.steps += 1
-        self._collisions += collided
         np.maximum(self._max, values, out=self._max)
         np.minimum(self._min, values, out=self._min)
         self._sum += values
+        self._values[6] += 1.0
+        self._values[7] += collided
 
     def clear(self, chosen: NDArray[np.bool_] | slice) -> None:
         """Begin the chosen episodes anew."""
-        self.steps[chosen] = 0
-        self._collisions[chosen] = 0
+        self._values[:, chosen] = 0.0
         self._max[:, chosen] = -np.inf
         self._min[:, chosen] = np.inf
-        self._sum[:, chosen] = 0.0
 
     def summary(self) -> dict[str, NDArray[Any]]:
-        """gym-gazebo2's figures and the number of steps, each (N,); its distance is the root mean square over x, y, z, m."""
-        mean = self._sum / np.maximum(self.steps, 1)
-        summary: dict[str, NDArray[Any]] = {
-            "ep_steps": self.steps.copy(),
-            "num_coll": self._collisions.copy(),
-        }
-        for row, name in enumerate(("dist", "rew")):
-            summary[f"ep_{name}_max"] = self._max[row].copy()
-            summary[f"ep_{name}_mean"] = mean[row]
-            summary[f"ep_{name}_min"] = self._min[row].copy()
+        """The figures of every episode so far, each (N,)."""
+        values = self._values.copy()
+        values[4:6] /= np.maximum(values[6], 1.0)
+        summary: dict[str, NDArray[Any]] = dict(zip(self.NAMES, values, strict=True))
+        for name in ("ep_steps", "num_coll"):
+            summary[name] = summary[name].astype(np.int64)
         return summary
+
+    def of(self, index: int) -> dict[str, float]:
+        """The figures of one episode so far, as plain numbers."""
+        *values, dist_sum, rew_sum, steps, collisions = self._values[:, index].tolist()
+        count = max(steps, 1.0)
+        values += [dist_sum / count, rew_sum / count, int(steps), int(collisions)]
+        return dict(zip(self.NAMES, values, strict=True))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self._values,)
+
+
+def _restored(values: Floats) -> EpisodeStatistics:
+    statistics = EpisodeStatistics(values.shape[1])
+    statistics._values[...] = values
+    return statistics

@@ -81,8 +81,8 @@ def play(model: BaseAlgorithm, env: VecNormalize) -> dict[str, NDArray[np.float6
             results[index] = results[index] or infos[index]
     finished = [result for result in results if result is not None]
     columns = (
-        [1000.0 * r["position_error"] for r in finished],
-        [np.degrees(r["angle_error"]) for r in finished],
+        [1000.0 * r.get("position_error", np.nan) for r in finished],
+        [np.degrees(r.get("angle_error", np.nan)) for r in finished],
         [r["ep_rew_mean"] for r in finished],
         [r["episode"]["r"] for r in finished],
         [r["num_coll"] for r in finished],

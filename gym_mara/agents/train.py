@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
@@ -20,7 +21,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from gym_mara.agents import presets
-from gym_mara.agents.callbacks import Keeper, Report, base_env, restore_random_state
+from gym_mara.agents.callbacks import (
+    ExplorationWidth,
+    Keeper,
+    Report,
+    base_env,
+    restore_random_state,
+)
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
 from gym_mara.agents.policy import DAMAGE, algorithm_class, load_policy
@@ -103,22 +110,26 @@ def _schedule(value: Any) -> Any:
 
 
 class LinearSchedule:
-    """From `start` at the first step to `end` at the last; a class, as a model on disk needs it."""
+    """From `start` at the first step to `end` at the last, and on; a class, as a model on disk needs it."""
 
     def __init__(self, start: float, end: float) -> None:
         self.start, self.end = start, end
 
     def __call__(self, progress_remaining: float) -> float:
-        return self.end + (self.start - self.end) * progress_remaining
+        # The last rollout may reach beyond the last step.
+        return self.end + (self.start - self.end) * max(0.0, progress_remaining)
 
 
 def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
     model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
     report(model.num_timesteps, {})
+    callbacks: list[BaseCallback] = [Keeper(run, best, report)]
+    if (width := presets.Preset(**run.config.preset).log_std) is not None:
+        callbacks.append(ExplorationWidth(LinearSchedule(*width[1:]), run.config.steps))
     try:
         model.learn(
             run.config.steps - model.num_timesteps,
-            callback=Keeper(run, best, report),
+            callback=callbacks,
             reset_num_timesteps=False,
         )
     finally:  # an interrupt among the ways out

@@ -88,7 +88,8 @@ class Task(ABC):
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
         """The rewards (N,) and the terms they are made of, each (N,), which `info` reports.
 
-        Of a term named `distance` the episode's statistics are kept.
+        Three names have a meaning elsewhere: of `distance` (m) the episode's statistics are kept, and `position_error`
+        (m) and `angle_error` (rad) are what an evaluation prints.
         """
 
     def terminated(self, state: SimState, goal: Goal) -> NDArray[np.bool_]:
