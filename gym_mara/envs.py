@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.simulation import Mask, Simulation
 from gym_mara.tasks import Task
@@ -124,8 +124,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     ) -> None:
         _check_render_mode(render_mode)
         self.render_mode = render_mode
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise GymMaraError(f"max_episode_steps must be at least 1, not {max_episode_steps!r}")
+        if max_episode_steps is not None:
+            max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
         self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options)
         self.num_envs = self.simulation.num_envs
         self.single_observation_space = self.simulation.observation_space

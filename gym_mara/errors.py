@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import math
+import numbers
 from collections.abc import Iterable
+from typing import Any
 
 
 class GymMaraError(ValueError):
@@ -21,6 +24,33 @@ class MissingExtraError(GymMaraError, ImportError):
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
         return type(self), (self.part, self.library, self.extra)
+
+
+def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = False) -> float:
+    """A value that must be a finite, positive number, or zero where that is allowed.
+
+    Raises:
+        GymMaraError: it is not.
+    """
+    if not isinstance(value, bool) and isinstance(value, numbers.Real):
+        number = float(value)
+        if 0.0 < number < math.inf or (or_zero and number == 0.0):
+            return number
+    wanted = "not negative" if or_zero else "positive"
+    raise GymMaraError(
+        f"{name} must be finite and {wanted}{f' ({unit})' if unit else ''}, not {value!r}"
+    )
+
+
+def whole_number(name: str, value: Any) -> int:
+    """A value that must be a whole number of at least 1.
+
+    Raises:
+        GymMaraError: it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
+        raise GymMaraError(f"{name} must be a whole number of at least 1, not {value!r}")
+    return int(value)
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> GymMaraError:

@@ -15,6 +15,9 @@ _RIGHT_INDEX = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]
 _RIGHT_SIGN = np.array(
     [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]]
 )
+# Components no larger than this count as zero, and how much each outweighs the next.
+_ZERO = 1e-9
+_PRECEDENCE = np.array([1e30, 1e20, 1e10, 1.0])
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
@@ -34,8 +37,18 @@ def conjugate(q: Floats) -> Floats:
 
 
 def canonical(q: Floats) -> Floats:
-    """Of the two quaternions (..., 4) of a rotation the one with w >= 0."""
-    return q * np.copysign(1.0, q[..., :1])
+    """Of the two quaternions (..., 4) of a rotation the one with w >= 0.
+
+    For half a turn, w = 0 but for rounding, it is the one whose first component that is not zero is positive.
+    """
+    w = q[..., :1]
+    if np.count_nonzero(np.abs(w) > _ZERO) == w.size:
+        return q * np.copysign(1.0, w)
+    # Each component outweighs all that follow it, unless it counts as zero.
+    sign = np.copysign(1.0, (q * (np.abs(q) > _ZERO)) @ _PRECEDENCE)[..., None]
+    chosen = q * sign
+    chosen[..., 0] = np.abs(chosen[..., 0])
+    return chosen
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:
@@ -80,5 +93,4 @@ def from_matrix(rotation: Floats) -> Floats:
     outer = rotation.reshape(-1, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
     largest = outer[:, 0, ::5].argmax(axis=-1)  # of the diagonal of 4 q qᵀ
     row = outer.reshape(-1, 4, 4)[rows, largest]
-    length = np.copysign(2.0 * np.sqrt(row[rows, largest]), row[:, 0])
-    return row / length[:, None]
+    return canonical(row / (2.0 * np.sqrt(row[rows, largest]))[:, None])

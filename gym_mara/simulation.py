@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.backends import make_backend
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.statistics import EpisodeStatistics
 from gym_mara.tasks import Task, make_task
@@ -58,13 +58,7 @@ class Simulation:
         backend: str,
         options: dict[str, Any],
     ) -> None:
-        if (
-            isinstance(num_envs, bool)
-            or not isinstance(num_envs, (int, np.integer))
-            or num_envs < 1
-        ):
-            raise GymMaraError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
-        self.num_envs = int(num_envs)
+        self.num_envs = whole_number("num_envs", num_envs)
         self.task, settings = make_task(task, options)
         self.robot = RobotModel.load(robot, ee_frame)
         self.backend = make_backend(backend, self.robot, self.num_envs, settings)

@@ -102,7 +102,10 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
         (["train", "--steps", "nan"], "--steps must be a whole number"),
         (["train", "--set", "robot"], "write NAME=VALUE"),
         (["train", "--set", "robot=ur55"], "Did you mean 'ur5'"),
-        (["train", "--set", "max_joint_velocity=-1"], "max_joint_velocity must be positive"),
+        (
+            ["train", "--set", "max_joint_velocity=-1"],
+            "max_joint_velocity must be finite and positive",
+        ),
         (["train", "--resume", "nowhere"], "is no run folder"),
         (["evaluate", "nowhere"], "is no run folder"),
         (["rewards"], "either --record FILE or --check FILE"),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 
@@ -24,11 +24,9 @@ class Backend(ABC):
     """
 
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
-        if not (np.isfinite(control_period) and control_period > 0):
-            raise GymMaraError(f"control_period must be positive (s), not {control_period!r}")
         self.robot = robot
         self.num_envs = num_envs
-        self.control_period = float(control_period)
+        self.control_period = positive_number("control_period", control_period, "s")
         self.joint_velocity = robot.velocity_limit
         """How fast the joints are at most in this backend (J,), rad/s."""
 

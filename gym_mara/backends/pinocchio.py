@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import make_checker
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]
+
+
+# What a snapshot holds: the arms' configuration, velocity and time, and what they touch.
+_STATE = ("q", "qd", "time", "collided", "touching")
 
 
 class PinocchioBackend(Backend):
@@ -45,29 +50,26 @@ class PinocchioBackend(Backend):
         path_resolution: float = 0.005,
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        if max_joint_velocity is not None and not 0.0 < max_joint_velocity < np.inf:
-            raise GymMaraError(
-                f"max_joint_velocity must be positive and finite (rad/s), or None for teleports; "
-                f"not {max_joint_velocity!r}"
-            )
-        if not 0.0 < path_resolution < np.inf:
-            raise GymMaraError(f"path_resolution must be positive (m), not {path_resolution!r}")
-        self.max_joint_velocity = max_joint_velocity
+        self.max_joint_velocity = None
         if max_joint_velocity is not None:
-            self.joint_velocity = np.full(robot.num_joints, float(max_joint_velocity))
-        self.path_resolution = path_resolution
+            velocity = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
+            self.max_joint_velocity = velocity
+            self.joint_velocity = np.full(robot.num_joints, velocity)
+        self.path_resolution = positive_number("path_resolution", path_resolution, "m")
         self._checker = make_checker(collision, robot, collision_threads)
         self._kinematics = robot.kinematics()
         self._q = np.tile(robot.home, (num_envs, 1))
         self._qd = np.zeros_like(self._q)
         self._time = np.zeros(num_envs)
         self._collided: NDArray[np.bool_] | None = None
+        self._touching = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
         rows = True if mask is None else mask[:, None]
         np.copyto(self._q, q, where=rows)
         np.copyto(self._qd, 0.0, where=rows)
         np.copyto(self._time, 0.0, where=True if mask is None else mask)
+        np.copyto(self._touching, False, where=True if mask is None else mask)
         self._collided = None
 
     def step(self, q_target: Floats) -> SimState:
@@ -83,22 +85,27 @@ class PinocchioBackend(Backend):
     def _travel(self, q_target: Floats, velocity: float) -> None:
         """Move along the path of one period, as far as the first collision on it."""
         way = q_target - self._q
-        samples = self._samples(np.minimum(np.abs(way), velocity * self.control_period))
-        times = self.control_period * np.arange(1, samples + 1) / samples
-        limits = (velocity * times)[:, None, None]
-        path = self._q + np.clip(way, -limits, limits)
-        path = np.where(np.abs(way) <= limits, q_target, path)  # exactly there, not nearly
-        hits = self._checker.check(path.reshape(-1, self.robot.num_joints)).reshape(samples, -1)
-        collided = np.asarray(hits.any(axis=0))
-        self._collided = collided
-        stop = np.where(collided, hits.argmax(axis=0), samples - 1)
-        self._q = path[stop, np.arange(self.num_envs)]
-        self._qd = np.where(self._q == q_target, 0.0, np.sign(way) * velocity)
-
-    def _samples(self, steps: Floats) -> int:
-        """In how many pieces to check a path whose joints move this far (N, J)."""
-        furthest = (steps * self.robot.reach).sum(axis=1).max()
-        return max(1, int(np.ceil(furthest / self.path_resolution)))
+        length = (np.minimum(np.abs(way), velocity * self.control_period) * self.robot.reach).sum(1)
+        samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
+        # The samples of all paths in one array, an arm's behind another's: which arm, and which of its samples.
+        arm = np.repeat(np.arange(self.num_envs), samples)
+        last = np.cumsum(samples) - 1
+        sample = np.arange(1, len(arm) + 1) - (last - samples + 1)[arm]
+        limit = (velocity * self.control_period * sample / samples[arm])[:, None]
+        path = self._q[arm] + np.clip(way[arm], -limit, limit)
+        arrived = np.abs(way[arm]) <= limit * (1.0 + 1e-9)
+        path[arrived] = q_target[arm][arrived]  # exactly there, not nearly
+        hit = self._checker.check(path)
+        first_hit = np.minimum.reduceat(
+            np.where(hit, np.arange(len(arm)), len(arm)), last - samples + 1
+        )
+        # An arm that was let go on in a collision passes through; any other stops where it comes into one.
+        stop = np.where(self._touching, last, np.minimum(first_hit, last))
+        collided = first_hit <= last
+        self._q = path[stop]
+        resting = (self._q == q_target) | (collided & ~self._touching)[:, None]
+        self._qd = np.where(resting, 0.0, np.sign(way) * velocity)
+        self._collided, self._touching = collided, collided.copy()
 
     @property
     def state(self) -> SimState:
@@ -120,16 +127,12 @@ class PinocchioBackend(Backend):
         )
 
     def save(self) -> dict[str, Any]:
-        return {
-            "q": self._q.copy(),
-            "qd": self._qd.copy(),
-            "time": self._time.copy(),
-            "collided": None if self._collided is None else self._collided.copy(),
-        }
+        return {name: copy.copy(getattr(self, f"_{name}")) for name in _STATE}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        self._q = snapshot["q"].copy()
-        self._qd = snapshot["qd"].copy()
-        self._time = snapshot["time"].copy()
-        collided = snapshot["collided"]
-        self._collided = None if collided is None else collided.copy()
+        if snapshot["q"].shape != self._q.shape:
+            raise GymMaraError(
+                f"the snapshot is of arms {snapshot['q'].shape}; these are {self._q.shape}"
+            )
+        for name in _STATE:
+            setattr(self, f"_{name}", copy.copy(snapshot[name]))

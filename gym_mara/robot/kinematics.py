@@ -76,8 +76,8 @@ class Kinematics:
             placement = pin.updateFramePlacement(self._model, self._data, self._frame)
             *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
             positions.append(position)
-            quaternions.append((w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z))
-        return np.array(positions), np.array(quaternions)
+            quaternions.append((w, x, y, z))
+        return np.array(positions), rotations.canonical(np.array(quaternions))
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""

@@ -60,6 +60,10 @@ class RobotModel:
         """
         if isinstance(robot, RobotModel):
             return robot
+        if not isinstance(robot, (str, Path)):
+            raise GymMaraError(
+                f"robot must be a name, the path of a URDF or a RobotModel, not {robot!r}"
+            )
         if isinstance(robot, Path) or robot.endswith((".urdf", ".xml")):
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")

@@ -71,7 +71,7 @@ def _make_revolute(joint: ElementTree.Element) -> None:
     joint.set("type", "revolute")
     limit = joint.find("limit")
     if limit is None:
-        limit = ElementTree.SubElement(joint, "limit", effort="inf", velocity="inf")
+        limit = ElementTree.SubElement(joint, "limit", effort="1e9", velocity="1e9")
     limit.set("lower", repr(-np.pi))
     limit.set("upper", repr(np.pi))
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from gym_mara import rotations
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.reachability import miss, reachable_pose
 from gym_mara.state import SimState
@@ -61,12 +61,8 @@ class ReachTask(Task):
                 "give a unit quaternion [w, x, y, z]"
             )
         for name in ("alpha", "beta", "gamma", "delta", "eta", "kappa"):
-            value = getattr(self, name)
-            positive = name in ("alpha", "kappa", "beta")
-            if not np.isfinite(value) or value < 0 or (positive and value == 0):
-                raise GymMaraError(
-                    f"{name} must be finite and {'positive' if positive else 'not negative'}, not {value!r}"
-                )
+            or_zero = name in ("gamma", "delta", "eta")
+            positive_number(name, getattr(self, name), or_zero=or_zero)
 
     def goal(self, robot: RobotModel, num_envs: int) -> Goal:
         """The target pose for each arm; warns where a target that was asked for is out of reach."""
@@ -89,8 +85,9 @@ class ReachTask(Task):
         high = [robot.upper, np.full(3, distance), np.full(3, speed)]
         low = [robot.lower, np.full(3, -distance), np.full(3, -speed)]
         if self.orientation:
-            high.insert(2, np.ones(4))
-            low.insert(2, np.array([0.0, -1.0, -1.0, -1.0]))
+            one = 1.0 + 1e-9  # a unit quaternion is one but for rounding
+            high.insert(2, np.full(4, one))
+            low.insert(2, np.array([0.0, -one, -one, -one]))
         return Box(np.concatenate(low), np.concatenate(high), dtype=np.float64)
 
     def observe(self, state: SimState, goal: Goal) -> Floats:

@@ -1,0 +1,205 @@
+"""The kinematic backend: teleports, and travel at a limited velocity with the whole path checked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gym_mara.backends.pinocchio import PinocchioBackend
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.robot.collision import make_checker
+from tests.helpers import COLLIDING_Q, PATH_ENDS, Floats, robot_model, uniform_q
+
+VELOCITY, PERIOD = 0.5, 0.02
+TRAVEL = VELOCITY * PERIOD
+
+
+def _backend(num_envs: int = 1, **settings: Any) -> PinocchioBackend:
+    return PinocchioBackend(robot_model("mara"), num_envs, **settings)
+
+
+def _on_the_way(start: Floats, target: Floats, travel: float) -> Floats:
+    """Where joints of equal speed are when each has moved at most this far."""
+    return start + np.clip(target - start, -travel, travel)
+
+
+def test_by_default_the_joints_are_at_their_targets_at_once_and_at_rest() -> None:
+    backend = _backend(3)
+    backend.reset(np.zeros((3, 6)))
+    target = uniform_q(backend.robot, 3, 0)
+    state = backend.step(target)
+    np.testing.assert_array_equal(state.q, target)
+    assert not state.qd.any()
+    assert not state.ee_velocity.any()
+
+
+def test_a_teleport_does_not_collide_on_its_way() -> None:
+    backend = _backend()
+    backend.reset(np.array([PATH_ENDS[0]]))
+    assert not backend.step(np.array([PATH_ENDS[1]])).collided[0]
+
+
+def test_a_teleport_says_what_the_checker_says() -> None:
+    q = uniform_q(robot_model("mara"), 40, 1)
+    backend = _backend(40)
+    backend.reset(np.zeros((40, 6)))
+    expected = make_checker("fcl", robot_model("mara")).check(q)
+    np.testing.assert_array_equal(backend.step(q).collided, expected)
+
+
+def test_the_joints_travel_so_far_a_period_and_arrive_exactly() -> None:
+    backend = _backend(max_joint_velocity=VELOCITY)
+    backend.reset(np.zeros((1, 6)))
+    target = np.array([[-0.0333, 0.0001, 0.02, 0.0, -0.015, 0.105]])
+    for number in range(1, 12):
+        state = backend.step(target)
+        assert not state.collided[0]
+        np.testing.assert_allclose(
+            state.q, _on_the_way(np.zeros(6), target, number * TRAVEL), rtol=0.0, atol=1e-12
+        )
+        left = np.abs(target) - number * TRAVEL
+        moving, arrived = left > 1e-9, left < 1e-9
+        np.testing.assert_array_equal(state.qd[moving], (np.sign(target) * VELOCITY)[moving])
+        np.testing.assert_array_equal(state.q[arrived], target[arrived])
+        assert not state.qd[arrived].any()
+    np.testing.assert_array_equal(state.q, target)
+    assert not state.ee_velocity.any()
+
+
+def test_the_velocity_of_the_tool_is_the_change_of_its_position() -> None:
+    backend = _backend(20, max_joint_velocity=1.0, control_period=1e-5)
+    start, target = uniform_q(backend.robot, 20, 2), uniform_q(backend.robot, 20, 3)
+    backend.reset(start)
+    before = backend.state
+    free = ~before.collided
+    assert free.any()
+    states = [before, backend.step(target), backend.step(target)]
+    change = (states[2].ee_position - states[0].ee_position) / 2e-5
+    np.testing.assert_allclose(states[1].ee_velocity[free], change[free], atol=1e-6)
+    assert (np.linalg.norm(states[1].ee_velocity[free], axis=1) > 1e-3).all()
+
+
+def test_a_way_whose_ends_are_free_but_whose_middle_is_not_ends_at_the_contact() -> None:
+    start, target = np.array(PATH_ENDS)
+    # The whole way in one period.
+    backend = _backend(max_joint_velocity=10.0, control_period=1.0)
+    backend.reset(start[None])
+    assert not backend.state.collided[0]
+    state = backend.step(target[None])
+    assert state.collided.tolist() == [True]
+    assert state.time.tolist() == [1.0]
+    fine = np.tile(start, (4801, 1))
+    fine[:, 3] = np.linspace(start[3], target[3], 4801)
+    hits = make_checker("coal", backend.robot).check(fine)
+    assert not hits[0]
+    assert not hits[-1]
+    contact = fine[hits.argmax(), 3]
+    between_checks = backend.path_resolution / backend.robot.reach[3]
+    assert contact - 0.001 <= state.q[0, 3] <= contact + between_checks
+    np.testing.assert_array_equal(np.delete(state.q[0], 3), np.delete(start, 3))
+    assert make_checker("fcl", backend.robot).check(state.q).tolist() == [True]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_an_arm_stops_at_the_first_contact_of_its_way(seed: int) -> None:
+    backend = _backend(max_joint_velocity=10.0, control_period=1.0)
+    checker = make_checker("coal", backend.robot)
+    free = uniform_q(backend.robot, 20, seed)
+    start, target = free[~checker.check(free)][:2]
+    travels = np.linspace(0.0, np.abs(target - start).max(), 1500)
+    hits = checker.check(np.array([_on_the_way(start, target, travel) for travel in travels]))
+    backend.reset(start[None])
+    state = backend.step(target[None])
+    if not state.collided[0]:
+        np.testing.assert_array_equal(state.q[0], target)
+        # A touch shorter than the way between two checks may go unseen.
+        depth = hits.sum() * (travels[1] - travels[0]) * backend.robot.reach.sum()
+        assert depth <= backend.path_resolution + 2 * travels[1] * backend.robot.reach.sum()
+        return
+    assert checker.check(state.q)[0]
+    travelled = np.abs(state.q[0] - start).max()
+    np.testing.assert_allclose(
+        state.q[0], _on_the_way(start, target, travelled), rtol=0.0, atol=1e-12
+    )
+    before = hits[travels < travelled - travels[1]]
+    assert before.sum() * travels[1] * backend.robot.reach.min() <= backend.path_resolution
+
+
+def test_one_arm_stops_and_the_others_go_on() -> None:
+    backend = _backend(2, max_joint_velocity=10.0, control_period=1.0)
+    backend.reset(np.array([PATH_ENDS[0], PATH_ENDS[0]]))
+    target = np.array([PATH_ENDS[1], np.zeros(6)])
+    state = backend.step(target)
+    assert state.collided.tolist() == [True, False]
+    np.testing.assert_array_equal(state.q[1], np.zeros(6))
+    assert not state.qd[1].any()
+    assert (state.q[0] != target[0]).any()
+
+
+def test_a_finer_path_resolution_stops_nearer_to_the_contact() -> None:
+    stops = []
+    for resolution in (0.2, 0.02, 0.002):
+        backend = _backend(max_joint_velocity=10.0, control_period=1.0, path_resolution=resolution)
+        backend.reset(np.array([PATH_ENDS[0]]))
+        state = backend.step(np.array([PATH_ENDS[1]]))
+        assert state.collided[0]
+        stops.append(state.q[0, 3])
+    assert stops[0] >= stops[1] >= stops[2]
+    assert stops[0] > stops[2]
+
+
+def test_at_the_contact_the_arm_can_go_back() -> None:
+    backend = _backend(max_joint_velocity=10.0, control_period=1.0)
+    backend.reset(np.array([PATH_ENDS[0]]))
+    backend.step(np.array([PATH_ENDS[1]]))
+    state = backend.step(np.array([PATH_ENDS[0]]))
+    assert state.collided.tolist() == [False]
+    np.testing.assert_array_equal(state.q[0], PATH_ENDS[0])
+
+
+def test_without_a_checker_nothing_collides() -> None:
+    backend = _backend(collision="none")
+    assert not backend.step(np.array([COLLIDING_Q])).collided[0]
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_other_robots_travel_too(name: str) -> None:
+    robot: RobotModel = robot_model(name)
+    backend = PinocchioBackend(robot, 1, max_joint_velocity=1.0, control_period=0.01)
+    start = robot.home[None]
+    backend.reset(start)
+    state = backend.step(np.clip(start + 0.5, robot.lower, robot.upper))
+    assert np.abs(state.q - start).max() == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"max_joint_velocity": 0}, r"max_joint_velocity must be finite and positive .*not 0"),
+        ({"max_joint_velocity": -1}, r"max_joint_velocity must be finite and positive.*not -1"),
+        (
+            {"max_joint_velocity": np.nan},
+            r"max_joint_velocity must be finite and positive.*not nan",
+        ),
+        (
+            {"max_joint_velocity": np.inf},
+            r"max_joint_velocity must be finite and positive.*not inf",
+        ),
+        ({"path_resolution": 0.0}, r"path_resolution must be finite and positive \(m\), not 0.0"),
+        (
+            {"path_resolution": np.nan},
+            r"path_resolution must be finite and positive \(m\), not nan",
+        ),
+        ({"path_resolution": -1.0}, r"path_resolution must be finite and positive \(m\), not -1.0"),
+        ({"control_period": 0.0}, r"control_period must be finite and positive \(s\), not 0.0"),
+        ({"collision": "bullet"}, r"unknown collision engine 'bullet'\..*coal, fcl"),
+    ],
+)
+def test_settings_out_of_their_range(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        _backend(**settings)

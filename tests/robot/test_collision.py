@@ -1,0 +1,136 @@
+"""Collision checking: what collides and what does not, and python-fcl against Coal."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.robot.collision import CollisionChecker, make_checker
+from tests.helpers import COLLIDING_Q, COPIES, PATH_ENDS, TARGET_Q, Floats, robot_model, uniform_q
+
+ENGINES = ("coal", "coal in threads", "fcl")
+CONTACT = 1e-4
+"""Nearer to contact than this, m, the engines may differ."""
+CHUNKS = 8
+
+
+@functools.cache
+def _checker(engine: str, robot: str) -> CollisionChecker:
+    name, _, threads = engine.partition(" ")
+    return make_checker(name, robot_model(robot), 2 if threads else 1)
+
+
+def _clearance(robot: RobotModel, q: Floats) -> float:
+    """The smallest distance of any pair, m, by Coal; negative where they overlap."""
+    data = robot.geometry.createData()
+    pin.computeDistances(robot.model, robot.model.createData(), robot.geometry, data, q)
+    return min(float(result.min_distance) for result in data.distanceResults)
+
+
+def _assert_agree(name: str, q: Floats) -> None:
+    coal, threads, fcl = (_checker(engine, name).check(q) for engine in ENGINES)
+    assert threads.tolist() == coal.tolist()
+    assert coal.any()
+    assert not coal.all()
+    apart = {int(row): _clearance(robot_model(name), q[row]) for row in np.flatnonzero(coal != fcl)}
+    assert {row: d for row, d in apart.items() if abs(d) > CONTACT} == {}
+
+
+@pytest.mark.parametrize("chunk", range(CHUNKS))
+def test_fcl_and_coal_agree_on_ten_thousand_configurations_of_mara(chunk: int) -> None:
+    q = uniform_q(robot_model("mara"), 10_000, 0)
+    _assert_agree("mara", q[chunk::CHUNKS])
+
+
+# A mesh is a surface to both engines: a body wholly inside another does not touch it.
+@pytest.mark.parametrize("name", ["ur5", "panda", "panda_collision"])
+def test_fcl_and_coal_agree_on_robots_of_meshes_and_capsules(name: str) -> None:
+    _assert_agree(name, uniform_q(robot_model(name), 200, 1))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(
+    ("q", "collides"),
+    [
+        pytest.param((0.0,) * 6, False, id="upright"),
+        pytest.param(TARGET_Q, False, id="at the target"),
+        pytest.param(COLLIDING_Q, True, id="in the table"),
+        pytest.param(PATH_ENDS[0], False, id="one end of the path"),
+        pytest.param((*PATH_ENDS[0][:3], 0.0, *PATH_ENDS[0][4:]), True, id="tool in the arm"),
+        pytest.param(PATH_ENDS[1], False, id="the other end"),
+    ],
+)
+def test_known_configurations(engine: str, q: tuple[float, ...], collides: bool) -> None:
+    assert _checker(engine, "mara").check(np.array([q])).tolist() == [collides]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_clearance_decides(engine: str) -> None:
+    """Beyond 0.1 mm of contact a flag is the sign of Coal's signed distance."""
+    mara = robot_model("mara")
+    q = uniform_q(mara, 300, 2)
+    clearance = np.array([_clearance(mara, row) for row in q])
+    clear = np.abs(clearance) > CONTACT
+    flags = _checker(engine, "mara").check(q)
+    np.testing.assert_array_equal(flags[clear], clearance[clear] < 0.0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("count", [1, 3, 7, 8, 9, 40])
+def test_a_flag_does_not_depend_on_its_batch(engine: str, count: int) -> None:
+    q = uniform_q(robot_model("mara"), count, 3)
+    checker = _checker(engine, "mara")
+    flags = checker.check(q)
+    assert flags.shape == (count,)
+    assert flags.dtype == np.bool_
+    assert flags.tolist() == [bool(checker.check(q[row : row + 1])[0]) for row in range(count)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_flags_are_never_changed_by_later_calls(engine: str) -> None:
+    checker = _checker(engine, "mara")
+    q = uniform_q(robot_model("mara"), 40, 4)
+    first = checker.check(q)
+    kept = first.copy()
+    checker.check(q[::-1])
+    np.testing.assert_array_equal(first, kept)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("duplicate", COPIES)
+def test_a_copy_says_the_same(
+    engine: str, duplicate: Callable[[CollisionChecker], CollisionChecker]
+) -> None:
+    q = uniform_q(robot_model("mara"), 20, 5)
+    checker = _checker(engine, "mara")
+    np.testing.assert_array_equal(duplicate(checker).check(q), checker.check(q))
+
+
+def test_two_checkers_of_one_robot_do_not_disturb_each_other(mara: RobotModel) -> None:
+    q = uniform_q(mara, 20, 6)
+    first, second = make_checker("coal", mara), make_checker("coal", mara)
+    expected = first.check(q)
+    for row in range(20):
+        second.check(q[19 - row : 20 - row])
+        assert first.check(q[row : row + 1])[0] == expected[row]
+
+
+def test_none_finds_no_collision(mara: RobotModel) -> None:
+    assert make_checker("none", mara).check(np.array([COLLIDING_Q] * 3)).tolist() == [False] * 3
+
+
+def test_an_unknown_engine_is_named_with_the_known_ones(mara: RobotModel) -> None:
+    with pytest.raises(GymMaraError, match=r"unknown collision engine 'bullet'.*coal, fcl, none"):
+        make_checker("bullet", mara)
+
+
+@pytest.mark.parametrize(("engine", "threads"), [("coal", 0), ("coal", -1), ("fcl", 2)])
+def test_threads_that_an_engine_does_not_have(mara: RobotModel, engine: str, threads: int) -> None:
+    with pytest.raises(GymMaraError, match=f"at least 1, and 1 but for 'coal'; not {threads} for"):
+        make_checker(engine, mara, threads)

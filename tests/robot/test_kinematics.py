@@ -1,0 +1,141 @@
+"""Forward kinematics in NumPy: golden values, and Pinocchio as referee on every robot."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from gym_mara.robot import RobotModel
+from gym_mara.robot.catalog import robot_names
+from gym_mara.robot.kinematics import Kinematics
+from tests.helpers import (
+    COPIES,
+    Floats,
+    golden,
+    golden_q,
+    joint_xml,
+    robot_model,
+    uniform_q,
+    urdf_xml,
+    write,
+)
+
+
+def _assert_agrees_with_pinocchio(robot: RobotModel, count: int) -> None:
+    q = uniform_q(robot, count, 0)
+    qd = np.random.default_rng(1).normal(size=q.shape)
+    kinematics = robot.kinematics()
+    position, quaternion = kinematics.pose(q)
+    velocity = kinematics.velocity(q, qd)
+    assert position.shape == velocity.shape == (count, 3)
+    assert quaternion.shape == (count, 4)
+    data = robot.model.createData()
+    frame = robot.model.getFrameId(robot.ee_frame, pin.FrameType.BODY)
+    for row in range(count):
+        pin.forwardKinematics(robot.model, data, q[row], qd[row])
+        pose = pin.updateFramePlacement(robot.model, data, frame)
+        motion = pin.getFrameVelocity(robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        w, x, y, z = quaternion[row]
+        np.testing.assert_allclose(position[row], pose.translation, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            pin.Quaternion(w, x, y, z).matrix(), pose.rotation, rtol=0.0, atol=1e-12
+        )
+        np.testing.assert_allclose(velocity[row], motion.linear, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, rtol=0.0, atol=1e-12)
+    assert (quaternion[:, 0] >= 0.0).all()
+
+
+def test_mara_stands_where_the_published_figures_put_it(mara: RobotModel) -> None:
+    expected = golden("kinematics_golden.csv")
+    position, quaternion = mara.kinematics().pose(golden_q())
+    np.testing.assert_allclose(
+        position, np.stack([expected[f"ee_{axis}"] for axis in "xyz"], axis=-1), rtol=0, atol=1e-7
+    )
+    wanted = np.stack([expected[f"ee_q{axis}"] for axis in "wxyz"], axis=-1)
+    wanted *= np.where(wanted[:, :1] < 0.0, -1.0, 1.0)
+    np.testing.assert_allclose(quaternion, wanted, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_pose_and_velocity_are_pinocchios(name: str) -> None:
+    for count in (1, 50):
+        _assert_agrees_with_pinocchio(robot_model(name), count)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_pose_and_velocity_are_pinocchios_with_sliding_and_slanting_joints(
+    tmp_path: Path, count: int
+) -> None:
+    kinds = [
+        joint_xml(0, "prismatic", "0 1 0"),
+        joint_xml(1, "revolute", "1 2 -0.5"),
+        joint_xml(2, "continuous", "0 -1 0"),
+        joint_xml(3, "prismatic", "1 0 1"),
+        joint_xml(4, "revolute", "0 0 -1"),
+    ]
+    urdf = write(tmp_path / "stick.urdf", urdf_xml(*kinds[:count]))
+    robot = RobotModel.load(urdf, f"link{count}")
+    assert robot.num_joints == count
+    for batch in (1, 20):
+        _assert_agrees_with_pinocchio(robot, batch)
+
+
+def test_velocity_is_the_change_of_position(mara: RobotModel) -> None:
+    kinematics = mara.kinematics()
+    q, qd = uniform_q(mara, 20, 2), uniform_q(mara, 20, 3)
+    ahead, behind = kinematics.pose(q + 1e-6 * qd)[0], kinematics.pose(q - 1e-6 * qd)[0]
+    np.testing.assert_allclose(kinematics.velocity(q, qd), (ahead - behind) / 2e-6, atol=1e-7)
+
+
+# The engine of the computation changes between few and many configurations.
+@pytest.mark.parametrize("count", [2, 3, 7, 8, 40, 300])
+def test_a_row_does_not_depend_on_its_batch(mara: RobotModel, count: int) -> None:
+    q, qd = uniform_q(mara, count, 5), uniform_q(mara, count, 6)
+    kinematics = mara.kinematics()
+    position, quaternion = kinematics.pose(q)
+    velocity = kinematics.velocity(q, qd)
+    for row in range(count):
+        one = slice(row, row + 1)
+        alone = kinematics.pose(q[one])
+        np.testing.assert_allclose(position[one], alone[0], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(quaternion[one], alone[1], rtol=0.0, atol=1e-12)
+        alone_velocity = kinematics.velocity(q[one], qd[one])
+        np.testing.assert_allclose(velocity[one], alone_velocity, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 4, 40])
+def test_results_are_never_changed_by_later_calls(mara: RobotModel, count: int) -> None:
+    kinematics = mara.kinematics()
+
+    def results(seed: int) -> list[Floats]:
+        q = uniform_q(mara, count, seed)
+        return [*kinematics.pose(q), kinematics.velocity(q, q)]
+
+    first = results(7)
+    kept = copy.deepcopy(first)
+    results(8)
+    for array, copied in zip(first, kept, strict=True):
+        np.testing.assert_array_equal(array, copied)
+
+
+def test_many_batch_sizes_in_turn_give_what_a_fresh_instance_gives(mara: RobotModel) -> None:
+    used = mara.kinematics()
+    for count in [*range(1, 15), 3, 1, 200, 2]:
+        q = uniform_q(mara, count, count)
+        for mine, fresh in zip(used.pose(q), mara.kinematics().pose(q), strict=True):
+            np.testing.assert_array_equal(mine, fresh)
+
+
+@pytest.mark.parametrize("duplicate", COPIES)
+def test_a_copy_computes_the_same(
+    mara: RobotModel, duplicate: Callable[[Kinematics], Kinematics]
+) -> None:
+    kinematics = mara.kinematics()
+    other = duplicate(kinematics)
+    q = uniform_q(mara, 3, 9)
+    np.testing.assert_array_equal(other.pose(q)[0], kinematics.pose(q)[0])

@@ -1,0 +1,341 @@
+"""MaraVectorEnv: the numbers of single environments, for which Gymnasium's SyncVectorEnv is the referee."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.statistics import EpisodeStatistics
+from tests.helpers import COLLIDING_Q, COPIES, ENV_IDS, TASK_NAMES, Floats, pickled
+
+MODES = ("NextStep", "SameStep")
+ON_COLLISION = ("reset", "terminate", "continue")
+
+VecEnv = VectorEnv[Any, Any, Any]
+
+
+def _pair(name: str, count: int, mode: str, **options: Any) -> tuple[MaraVectorEnv, VecEnv]:
+    """The native vector env, and Gymnasium's own over single envs."""
+    native = gymnasium.make_vec(name, num_envs=count, autoreset_mode=mode, **options)
+    assert type(native) is MaraVectorEnv
+    singles = gymnasium.make_vec(
+        name,
+        num_envs=count,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode(mode)},
+        **options,
+    )
+    return native, singles
+
+
+def _assert_same_info(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
+    """Equal masks; equal values where the masks are set, dictionaries by their own masks.
+
+    But `statistics`, which single envs report at every step, come at the end of an episode only.
+    """
+    for key in {k for k in (*mine, *theirs) if not k.startswith("_")}:
+        mask = mine[f"_{key}"] if f"_{key}" in mine else np.zeros(0, np.bool_)
+        if key not in theirs:
+            assert not mask.any(), key
+            continue
+        if key == "statistics":
+            assert theirs[f"_{key}"][mask].all()
+            for name in EpisodeStatistics.NAMES if mask.any() else ():
+                one, other = (info[key][name][mask] for info in (mine, theirs))
+                np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-11, err_msg=name)
+            continue
+        np.testing.assert_array_equal(mask, theirs[f"_{key}"], err_msg=key)
+        if isinstance(theirs[key], dict):
+            _assert_same_info(mine[key], theirs[key])
+            continue
+        assert mine[key].dtype == theirs[key].dtype, key
+        for one, other in zip(mine[key][mask], theirs[key][mask], strict=True):
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-11, err_msg=key)
+        if theirs[key].dtype == object:
+            assert all(value is None for value in mine[key][~mask])
+        else:
+            assert not mine[key][~mask].any()
+
+
+def _assert_same_course(native: VecEnv, singles: VecEnv, steps: int, limit: float = 2.5) -> None:
+    """Both take the same random actions; every number agrees, and something of each kind happens."""
+    rng = np.random.default_rng(0)
+    observation, _ = native.reset(seed=3)
+    np.testing.assert_allclose(observation, singles.reset(seed=3)[0], rtol=0.0, atol=1e-12)
+    collisions = ends = 0
+    target = np.zeros(native.action_space.shape or ())
+    for _ in range(steps):
+        # Some joints rest: the arms' ways differ in length.
+        moves = rng.random(target.shape) < rng.random((len(target), 1))
+        target = np.where(moves, rng.uniform(-limit, limit, target.shape), target)
+        mine, theirs = native.step(target), singles.step(target)
+        for one, other in zip(mine[:2], theirs[:2], strict=True):
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
+        for one, other in zip(mine[2:4], theirs[2:4], strict=True):
+            np.testing.assert_array_equal(one, other)
+        _assert_same_info(mine[4], theirs[4])
+        assert native.observation_space.contains(mine[0])
+        collisions += int(np.sum(mine[4]["collided"]))
+        if "final_info" in mine[4]:
+            collisions += int(np.sum(mine[4]["final_info"]["collided"]))
+        ends += int(np.sum(mine[2] | mine[3]))
+        ended = mine[2] | mine[3]
+        reported = mine[4].get("final_info", {}) if "final_info" in mine[4] else mine[4]
+        nothing = np.zeros(len(ended), np.bool_)
+        np.testing.assert_array_equal(reported.get("_statistics", nothing), ended)
+    assert collisions > 0
+    assert ends > 0
+    native.close()
+    singles.close()
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("on_collision", ON_COLLISION)
+@pytest.mark.parametrize("velocity", [None, 5.0], ids=["teleport", "travel"])
+def test_it_gives_the_numbers_of_single_envs(
+    mara: RobotModel, count: int, mode: str, on_collision: str, velocity: float | None
+) -> None:
+    native, singles = _pair(
+        "gym_mara/MARACollisionOrient-v0",
+        count,
+        mode,
+        robot=mara,
+        on_collision=on_collision,
+        max_joint_velocity=velocity,
+        control_period=0.1,
+        max_episode_steps=9,
+    )
+    _assert_same_course(native, singles, 25 if count == 40 else 40)
+
+
+@pytest.mark.parametrize("name", ENV_IDS)
+def test_every_id_gives_the_numbers_of_single_envs(mara: RobotModel, name: str) -> None:
+    native, singles = _pair(name, 3, "NextStep", robot=mara, max_episode_steps=6)
+    _assert_same_course(native, singles, 20)
+
+
+@pytest.mark.parametrize("on_collision", ON_COLLISION)
+def test_another_backend_gives_the_numbers_of_single_envs(
+    mara: RobotModel, fake_backend: str, on_collision: str
+) -> None:
+    options = {"robot": mara, "backend": fake_backend, "on_collision": on_collision}
+    native, singles = _pair("gym_mara/MARA-v0", 3, "SameStep", max_episode_steps=6, **options)
+    _assert_same_course(native, singles, 20)
+
+
+def test_a_half_turn_from_the_target_shows_the_same_axis_as_in_a_single_env() -> None:
+    """There w is zero but for rounding, which must not choose the sign of the rest."""
+    q = np.random.default_rng(0).uniform(-0.7, 0.7, (100, 6))
+    # motor2 and motor3 cancel: the tool points straight up.
+    q[:, 2], q[:, 4:] = q[:, 1], 0.0
+    batch, single = MaraVectorEnv(100, "MARAOrient-v0"), MaraEnv("MARAOrient-v0")
+    batch.reset()
+    together = batch.step(q)[0]
+    assert (together[:, 9] < 1e-12).all()
+    for action, observation in zip(q, together, strict=True):
+        single.reset()
+        np.testing.assert_allclose(single.step(action)[0], observation, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", TASK_NAMES)
+def test_its_spaces_are_batches_of_the_single_envs(name: str) -> None:
+    env = MaraVectorEnv(5, name)
+    single = gymnasium.make(f"gym_mara/{name}")
+    assert env.single_observation_space == single.observation_space
+    assert env.single_action_space == single.action_space
+    assert env.observation_space == batch_space(single.observation_space, 5)
+    assert env.action_space == batch_space(single.action_space, 5)
+    observation, _ = env.reset()
+    assert env.observation_space.contains(observation)
+    assert observation.shape == (5, 16 if "Orient" in name else 12)
+
+
+def _random_actions(count: int, steps: int, seed: int = 0) -> Floats:
+    return np.random.default_rng(seed).uniform(-2.3, 2.3, (steps, count, 6))
+
+
+def test_what_a_step_returned_is_never_changed_afterwards() -> None:
+    env = MaraVectorEnv(3, "MARACollisionOrient-v0", max_episode_steps=3)
+    returned: list[Any] = [env.reset()]
+    for actions in _random_actions(3, 10):
+        returned.append(env.step(actions))
+        if len(returned) == 5:
+            kept = copy.deepcopy(returned)
+    assert str(returned[:5]) == str(kept)
+    np.testing.assert_array_equal(returned[0][0], kept[0][0])
+
+
+def test_next_step_begins_an_episode_a_step_later_and_ignores_that_action() -> None:
+    env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="NextStep")
+    start, _ = env.reset()
+    env.step(np.full((2, 6), 0.1))
+    last, _, _, truncated, _ = env.step(np.full((2, 6), 0.2))
+    assert truncated.all()
+    np.testing.assert_allclose(last[:, :6], 0.2)
+    observation, reward, terminated, truncated, info = env.step(np.full((2, 6), 0.3))
+    np.testing.assert_array_equal(observation, start)
+    for nothing in (reward, terminated, truncated):
+        assert not nothing.any()
+    assert not info["_distance"].any()
+
+
+def test_same_step_shows_the_start_and_keeps_the_final_observation() -> None:
+    env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="SameStep")
+    start, _ = env.reset()
+    env.step(np.full((2, 6), 0.1))
+    observation, reward, _, truncated, info = env.step(np.full((2, 6), 0.2))
+    assert truncated.all()
+    np.testing.assert_array_equal(observation, start)
+    assert info["_final_obs"].all()
+    for final in info["final_obs"]:
+        np.testing.assert_allclose(final[:6], 0.2)
+    distance = info["final_info"]["distance"]
+    expected = [np.sqrt(np.mean(final[6:9] ** 2)) for final in info["final_obs"]]
+    np.testing.assert_allclose(distance, expected)
+    assert (reward == env.step(np.full((2, 6), 0.2))[1]).all(), "the reward is of the final pose"
+
+
+def test_disabled_waits_for_the_user_to_reset() -> None:
+    env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="Disabled")
+    start, _ = env.reset()
+    env.step(np.full((2, 6), 0.1))
+    env.reset(options={"reset_mask": np.array([True, False])})
+    _, _, _, truncated, _ = env.step(np.full((2, 6), 0.2))
+    assert truncated.tolist() == [False, True]
+    with pytest.raises(GymMaraError, match=r"episodes have ended: reset them.*reset_mask"):
+        env.step(np.full((2, 6), 0.3))
+    observation, _ = env.reset(options={"reset_mask": np.array([False, True])})
+    np.testing.assert_array_equal(observation[1], start[1])
+    np.testing.assert_allclose(observation[0, :6], 0.2)
+    env.step(np.full((2, 6), 0.3))
+
+
+def test_without_a_length_an_episode_does_not_end() -> None:
+    env = MaraVectorEnv(2, max_episode_steps=None, on_collision="continue")
+    env.reset()
+    assert not any(env.step(actions)[3].any() for actions in _random_actions(2, 20))
+
+
+@pytest.mark.parametrize("duplicate", COPIES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("velocity", [None, 1.0])
+def test_a_copy_goes_on_identically(
+    duplicate: Callable[[MaraVectorEnv], MaraVectorEnv], mode: str, velocity: float | None
+) -> None:
+    env = MaraVectorEnv(
+        3,
+        "MARACollisionOrient-v0",
+        max_episode_steps=5,
+        autoreset_mode=mode,
+        max_joint_velocity=velocity,
+    )
+    env.reset(seed=1)
+    for actions in _random_actions(3, 5):
+        env.step(actions)
+    other = duplicate(env)
+    for actions in _random_actions(3, 8, seed=1):
+        assert str(env.step(actions)) == str(other.step(actions))
+    assert env.np_random.random() == other.np_random.random()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("velocity", [None, 1.0])
+def test_it_goes_back_to_a_saved_state(mode: str, velocity: float | None) -> None:
+    options: dict[str, Any] = {"autoreset_mode": mode, "max_joint_velocity": velocity}
+    env = MaraVectorEnv(3, "MARACollision-v0", max_episode_steps=5, **options)
+    env.reset(seed=1)
+    for actions in _random_actions(3, 5):
+        env.step(actions)
+    snapshot = pickled(env.save_state())
+    course = [str(env.step(actions)) for actions in _random_actions(3, 8, seed=1)]
+    drawn = env.np_random.random()
+    other = MaraVectorEnv(3, "MARACollision-v0", max_episode_steps=5, **options)
+    for each in (env, other, env):
+        each.restore_state(snapshot)
+        assert [str(each.step(a)) for a in _random_actions(3, 8, seed=1)] == course
+        assert each.np_random.random() == drawn
+
+
+def test_a_seed_may_be_given_for_each_arm() -> None:
+    env = MaraVectorEnv(2)
+    env.reset(seed=[4, 5])
+    drawn = env.np_random.random()
+    env.reset(seed=4)
+    assert env.np_random.random() == drawn
+    with pytest.raises(GymMaraError, match="3 seeds for 2 environments"):
+        env.reset(seed=[1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    "mask", [[True], np.ones(2), np.zeros(2, np.bool_), np.ones((2, 1), np.bool_)]
+)
+def test_a_wrong_reset_mask(mask: Any) -> None:
+    env = MaraVectorEnv(2)
+    env.reset()
+    with pytest.raises(GymMaraError, match=r"reset_mask must be bool, of shape \(2,\)"):
+        env.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, True, "two", None])
+def test_a_wrong_number_of_envs(count: Any) -> None:
+    with pytest.raises(
+        GymMaraError, match=f"num_envs must be a whole number of at least 1, not {count!r}"
+    ):
+        MaraVectorEnv(count)
+
+
+def test_a_number_of_envs_may_be_numpys() -> None:
+    env = MaraVectorEnv(np.int64(2))  # type: ignore[arg-type]
+    assert env.reset()[0].shape == (2, 12)
+
+
+@pytest.mark.parametrize("steps", [0, -3, 2.5, True])
+def test_a_wrong_length_of_an_episode(steps: Any) -> None:
+    with pytest.raises(GymMaraError, match="max_episode_steps must be"):
+        MaraVectorEnv(1, max_episode_steps=steps)
+
+
+def test_an_unknown_autoreset_mode_is_named_with_the_known_ones() -> None:
+    with pytest.raises(GymMaraError, match=r"unknown autoreset_mode 'Never'.*Disabled, NextStep"):
+        MaraVectorEnv(1, autoreset_mode="Never")
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((3, 6)), r"the action has shape \(3, 6\); mara wants \(2, 6\)"),
+        (np.zeros((2, 5)), r"the action has shape \(2, 5\); mara wants \(2, 6\)"),
+        (np.zeros(6), r"the action has shape \(6,\); mara wants \(2, 6\)"),
+        (np.array([[0.1] * 6, [np.nan] + [0.1] * 5]), "the action holds NaN or infinity"),
+        (np.array([[0.1] * 6, [np.inf] + [0.1] * 5]), "the action holds NaN or infinity"),
+    ],
+)
+def test_wrong_actions_move_no_arm(actions: Floats, message: str) -> None:
+    env = MaraVectorEnv(2, max_joint_velocity=1.0)
+    env.reset()
+    env.step(np.full((2, 6), 0.1))
+    before = str(env.save_state()["backend"])
+    with pytest.raises(GymMaraError, match=message):
+        env.step(actions)
+    assert str(env.save_state()["backend"]) == before
+
+
+def test_one_arm_that_collides_leaves_the_others_alone() -> None:
+    env = MaraVectorEnv(3, "MARACollision-v0")
+    env.reset()
+    actions = np.array([COLLIDING_Q, [0.2] * 6, COLLIDING_Q])
+    _, _, _, _, info = env.step(actions)
+    assert info["collided"].tolist() == [True, False, True]
+    q = env.simulation.backend.state.q
+    np.testing.assert_array_equal(q, [[0.0] * 6, [0.2] * 6, [0.0] * 6])
