@@ -1,7 +1,7 @@
 """Hyperparameters, apart from the code that uses them.
 
-A preset says how many arms an agent trains on, what is normalised, and the arguments of the algorithm. Schedules are
-written ("linear", start, end): from start at the first step to end at the last.
+A preset says how many arms an agent trains on, what is normalised, and the arguments of the algorithm. A value that
+changes over the run is written as points (progress, value), the progress from 0 to 1, with straight lines between them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 from gym_mara.errors import unknown
 
-Schedule = tuple[str, float, float]
+Schedule = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -27,24 +27,44 @@ class Preset:
     normalise_reward: bool = False
 
 
-_PPO_REACH = Preset(
+# What an arm does next hangs on its action alone, hence no discounted future (γ = 0). Many arms, a narrow start and a
+# learning rate that falls to zero; the entropy bonus keeps the policy from narrowing before it is on the peak.
+_PPO_POSITION = Preset(
     num_envs=256,
     arguments={
         "n_steps": 16,
         "batch_size": 1024,
-        "n_epochs": 20,
-        "gamma": 0.5,
-        "gae_lambda": 0.95,
-        "learning_rate": ("linear", 2e-3, 0.0),
+        "n_epochs": 10,
+        "gamma": 0.0,
+        "learning_rate": ((0.0, 2e-3), (1.0, 0.0)),
         "clip_range": 0.2,
-        "target_kl": 0.02,
+        "ent_coef": 0.03,
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
     },
+)
+# Close to the target the reward hardly tells one orientation from another, and tells positions apart all the more: the
+# policy must stay wide while it finds the orientation, and narrow only at the end, for the position.
+_PPO_ORIENTATION = Preset(
+    num_envs=256,
+    arguments={
+        "n_steps": 8,
+        "batch_size": 1024,
+        "n_epochs": 5,
+        "gamma": 0.0,
+        "learning_rate": ((0.0, 2e-3), (0.2, 2e-3), (0.7, 2e-4), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -2.5},
+    },
+    log_std=((0.0, -2.5), (0.2, -3.0), (0.7, -3.0), (1.0, -6.0)),
 )
 
 # Algorithm → task → preset; a task that is not named has that of "default".
 PRESETS: dict[str, dict[str, Preset]] = {
-    "ppo": {"default": _PPO_REACH},
+    "ppo": {
+        "default": _PPO_POSITION,
+        "MARAOrient-v0": _PPO_ORIENTATION,
+        "MARACollisionOrient-v0": _PPO_ORIENTATION,
+    },
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -102,22 +103,21 @@ def use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _schedule(value: Any) -> Any:
-    """A preset's value as the algorithm wants it."""
-    if isinstance(value, (tuple, list)) and value and value[0] == "linear":
-        return LinearSchedule(*value[1:])
-    return value
+class PiecewiseLinear:
+    """A value that changes linearly between points, (progress from 0 to 1, value); a class, as a model on disk needs it."""
 
-
-class LinearSchedule:
-    """From `start` at the first step to `end` at the last, and on; a class, as a model on disk needs it."""
-
-    def __init__(self, start: float, end: float) -> None:
-        self.start, self.end = start, end
+    def __init__(self, points: Sequence[Sequence[float]]) -> None:
+        self._progress, self._values = zip(*points, strict=True)
 
     def __call__(self, progress_remaining: float) -> float:
-        # The last rollout may reach beyond the last step.
-        return self.end + (self.start - self.end) * max(0.0, progress_remaining)
+        """The value at a progress as Stable-Baselines3 counts it, from 1 down to 0; its last beyond that."""
+        return float(np.interp(1.0 - progress_remaining, self._progress, self._values))
+
+
+def _schedule(value: Any) -> Any:
+    """A preset's value as the algorithm wants it."""
+    is_points = isinstance(value, (tuple, list)) and value and isinstance(value[0], (tuple, list))
+    return PiecewiseLinear(value) if is_points else value
 
 
 def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
@@ -125,7 +125,7 @@ def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Rep
     report(model.num_timesteps, {})
     callbacks: list[BaseCallback] = [Keeper(run, best, report)]
     if (width := presets.Preset(**run.config.preset).log_std) is not None:
-        callbacks.append(ExplorationWidth(LinearSchedule(*width[1:]), run.config.steps))
+        callbacks.append(ExplorationWidth(PiecewiseLinear(width), run.config.steps))
     try:
         model.learn(
             run.config.steps - model.num_timesteps,
