@@ -122,6 +122,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
+        self.closed = True  # until it is whole: Gymnasium closes even what could not be made
         _check_render_mode(render_mode)
         self.render_mode = render_mode
         if max_episode_steps is not None:
@@ -140,6 +141,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "autoreset_mode": self.autoreset_mode,
         }
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self.closed = False
 
     def reset(
         self,

@@ -21,6 +21,8 @@ class Preset:
     num_envs: int
     arguments: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the algorithm's class; see the module for schedules."""
+    full_covariance: bool = False
+    """Whether the policy explores with a full covariance, see `gym_mara.agents.covariance`."""
     log_std: Schedule | None = None
     """The logarithm of the policy's standard deviation over the run; None where the algorithm learns it."""
     normalise_observation: bool = False

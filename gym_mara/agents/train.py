@@ -29,6 +29,7 @@ from gym_mara.agents.callbacks import (
     base_env,
     restore_random_state,
 )
+from gym_mara.agents.covariance import FullCovariancePolicy
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
 from gym_mara.agents.policy import DAMAGE, algorithm_class, load_policy
@@ -95,7 +96,8 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    return algorithm_class(algo)("MlpPolicy", wrapped, seed=seed, device="cpu", **arguments)
+    policy = FullCovariancePolicy if preset.full_covariance else "MlpPolicy"
+    return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
 
 
 def use_one_thread() -> None:
