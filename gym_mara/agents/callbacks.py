@@ -116,27 +116,6 @@ def restore_random_state(state: tuple[Any, ...]) -> None:
     torch.set_rng_state(torch_state)
 
 
-class ExplorationWidth(BaseCallback):
-    """Sets the policy's standard deviation on a schedule instead of learning it.
-
-    Args:
-        log_std: its logarithm, of the remaining progress from 1 to 0.
-        total: the number of steps of the run.
-    """
-
-    def __init__(self, log_std: Callable[[float], float], total: int) -> None:
-        super().__init__()
-        self._schedule, self._total = log_std, total
-
-    def _on_rollout_start(self) -> None:
-        log_std: Any = self.model.policy.log_std
-        log_std.requires_grad_(False)
-        log_std.fill_(self._schedule(1.0 - self.model.num_timesteps / self._total))
-
-    def _on_step(self) -> bool:
-        return True
-
-
 def base_env(model: Any) -> MaraVecEnv:
     """The environment under a model's normalisation."""
     env = normalisation(model).venv

@@ -11,8 +11,6 @@ from typing import Any
 
 from gym_mara.errors import unknown
 
-Schedule = tuple[tuple[float, float], ...]
-
 
 @dataclass(frozen=True)
 class Preset:
@@ -20,18 +18,14 @@ class Preset:
 
     num_envs: int
     arguments: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the algorithm's class; see the module for schedules."""
-    full_covariance: bool = False
-    """Whether the policy explores with a full covariance, see `gym_mara.agents.covariance`."""
-    log_std: Schedule | None = None
-    """The logarithm of the policy's standard deviation over the run; None where the algorithm learns it."""
+    """Keyword arguments of the algorithm's class; see the module for values that change."""
     normalise_observation: bool = False
     normalise_reward: bool = False
 
 
 # What an arm does next hangs on its action alone, hence no discounted future (γ = 0). Many arms, a narrow start and a
 # learning rate that falls to zero; the entropy bonus keeps the policy from narrowing before it is on the peak.
-_PPO_POSITION = Preset(
+_PPO_REACH = Preset(
     num_envs=256,
     arguments={
         "n_steps": 16,
@@ -44,29 +38,10 @@ _PPO_POSITION = Preset(
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
     },
 )
-# Close to the target the reward hardly tells one orientation from another, and tells positions apart all the more: the
-# policy must stay wide while it finds the orientation, and narrow only at the end, for the position.
-_PPO_ORIENTATION = Preset(
-    num_envs=256,
-    arguments={
-        "n_steps": 8,
-        "batch_size": 1024,
-        "n_epochs": 5,
-        "gamma": 0.0,
-        "learning_rate": ((0.0, 2e-3), (0.2, 2e-3), (0.7, 2e-4), (1.0, 0.0)),
-        "clip_range": 0.2,
-        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -2.5},
-    },
-    log_std=((0.0, -2.5), (0.2, -3.0), (0.7, -3.0), (1.0, -6.0)),
-)
 
 # Algorithm → task → preset; a task that is not named has that of "default".
 PRESETS: dict[str, dict[str, Preset]] = {
-    "ppo": {
-        "default": _PPO_POSITION,
-        "MARAOrient-v0": _PPO_ORIENTATION,
-        "MARACollisionOrient-v0": _PPO_ORIENTATION,
-    },
+    "ppo": {"default": _PPO_REACH},
 }
 
 

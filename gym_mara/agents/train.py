@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
@@ -23,13 +22,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from gym_mara.agents import presets
 from gym_mara.agents.callbacks import (
-    ExplorationWidth,
     Keeper,
     Report,
     base_env,
     restore_random_state,
 )
-from gym_mara.agents.covariance import FullCovariancePolicy
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
 from gym_mara.agents.policy import DAMAGE, algorithm_class, load_policy
@@ -96,8 +93,7 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    policy = FullCovariancePolicy if preset.full_covariance else "MlpPolicy"
-    return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
+    return algorithm_class(algo)("MlpPolicy", wrapped, seed=seed, device="cpu", **arguments)
 
 
 def use_one_thread() -> None:
@@ -125,13 +121,10 @@ def _schedule(value: Any) -> Any:
 def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
     model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
     report(model.num_timesteps, {})
-    callbacks: list[BaseCallback] = [Keeper(run, best, report)]
-    if (width := presets.Preset(**run.config.preset).log_std) is not None:
-        callbacks.append(ExplorationWidth(PiecewiseLinear(width), run.config.steps))
     try:
         model.learn(
             run.config.steps - model.num_timesteps,
-            callback=callbacks,
+            callback=Keeper(run, best, report),
             reset_num_timesteps=False,
         )
     finally:  # an interrupt among the ways out

@@ -45,7 +45,7 @@ def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
     path = finished_run.path
     about = json.loads((path / "config.json").read_text())
     assert about["seed"] == 5
-    assert about["preset"]["arguments"]["n_steps"] == 8
+    assert about["preset"]["arguments"]["n_steps"] == 16
     assert {"gym_mara", "gymnasium", "torch", "pin", "python"} <= about["versions"].keys()
     assert [int(p.name) for p in finished_run.checkpoints()] == [ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
     for folder in (path / "best", path / "last", *finished_run.checkpoints()):
