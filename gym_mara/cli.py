@@ -214,8 +214,8 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
 
         def report(steps: int, shown: dict[str, float]) -> None:
             text = f"reward {shown['reward_per_step']:6.2f}" if "reward_per_step" in shown else ""
-            if "position_error_mm" in shown:
-                text += f"   evaluated: {shown['position_error_mm']:.1f} mm"
+            if "eval_position_error_mm" in shown:
+                text += f"   evaluated: {shown['eval_position_error_mm']:.1f} mm"
             bar.update(task, completed=min(steps, total), description=text)
 
         yield report

@@ -73,7 +73,7 @@ class Keeper(BaseCallback):
         steps = model.num_timesteps
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
-            self.shown[name] = value
+            self.shown[f"eval_{name}"] = value
         self.logger.record("time/total_timesteps", steps)
         self.logger.dump(steps)
         if self.shown["eval_reward_per_step"] > self.best:
@@ -99,8 +99,7 @@ class Keeper(BaseCallback):
         )
         if trained.norm_obs:
             env.obs_rms = trained.obs_rms
-        means = {name: float(values.mean()) for name, values in play(self.model, env).items()}
-        return {f"eval_{k}" if k == "reward_per_step" else k: v for k, v in means.items()}
+        return {name: float(values.mean()) for name, values in play(self.model, env).items()}
 
 
 def random_state() -> tuple[Any, ...]:

@@ -20,7 +20,7 @@ def plot_learning_curve(run: RunFolder) -> Path:
         axis.plot(*zip(*points, strict=True), style, label=label)  # type: ignore[attr-defined]
 
     draw(reward, "rollout/reward_per_step", "training", "C0-")
-    draw(reward, "eval/eval_reward_per_step", "deterministic policy", "C1o-")
+    draw(reward, "eval/reward_per_step", "deterministic policy", "C1o-")
     reward.axhline(10.0, color="grey", linewidth=0.8, linestyle=":")
     reward.set_ylabel("reward per step")
     reward.legend(loc="best")
