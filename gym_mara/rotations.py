@@ -15,8 +15,9 @@ _RIGHT_INDEX = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]
 _RIGHT_SIGN = np.array(
     [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]]
 )
-# Components no larger than this count as zero, and how much each outweighs the next.
-_ZERO = 1e-9
+ZERO = 1e-9
+"""Components no larger than this count as zero."""
+# How much each component outweighs the next.
 _PRECEDENCE = np.array([1e30, 1e20, 1e10, 1.0])
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
@@ -42,10 +43,10 @@ def canonical(q: Floats) -> Floats:
     For half a turn, w = 0 but for rounding, it is the one whose first component that is not zero is positive.
     """
     w = q[..., :1]
-    if np.count_nonzero(np.abs(w) > _ZERO) == w.size:
+    if np.count_nonzero(np.abs(w) > ZERO) == w.size:
         return q * np.copysign(1.0, w)
     # Each component outweighs all that follow it, unless it counts as zero.
-    sign = np.copysign(1.0, (q * (np.abs(q) > _ZERO)) @ _PRECEDENCE)[..., None]
+    sign = np.copysign(1.0, (q * (np.abs(q) > ZERO)) @ _PRECEDENCE)[..., None]
     chosen = q * sign
     chosen[..., 0] = np.abs(chosen[..., 0])
     return chosen

@@ -70,14 +70,16 @@ class Kinematics:
         return product[:, :3, 3].copy(), rotations.from_matrix(product[:, :3, :3])
 
     def _pose_one_by_one(self, q: Floats) -> tuple[Floats, Floats]:
-        positions, quaternions = [], []
+        positions, quaternions, half_turns = [], [], False
         for configuration in q:
             pin.forwardKinematics(self._model, self._data, configuration)
             placement = pin.updateFramePlacement(self._model, self._data, self._frame)
             *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
             positions.append(position)
-            quaternions.append((w, x, y, z))
-        return np.array(positions), rotations.canonical(np.array(quaternions))
+            quaternions.append((w, x, y, z) if w > 0.0 else (-w, -x, -y, -z))
+            half_turns = half_turns or abs(w) <= rotations.ZERO
+        found = np.array(quaternions)
+        return np.array(positions), rotations.canonical(found) if half_turns else found
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""

@@ -47,4 +47,6 @@ def collision_penalty(
     collided: NDArray[np.bool_], distance: Floats, delta: float, eta: float
 ) -> Floats:
     """δ (2 min(d, 0.5))^η on a collision, else 0, of d (...,), m."""
+    if not np.count_nonzero(collided):
+        return np.zeros(np.shape(distance))
     return collided * (delta * np.minimum(2.0 * distance, 1.0) ** eta)
