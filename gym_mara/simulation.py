@@ -99,12 +99,12 @@ class Simulation:
         reward, info = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
-        if self.task.on_collision != "continue" and np.count_nonzero(collided):
-            if self.task.on_collision == "reset":
-                self.backend.reset(self._start, collided)
-            else:
-                terminated = terminated | collided
-        self.statistics.add(info.get("distance", reward * np.nan), reward, collided)
+        if self.task.on_collision == "terminate":
+            terminated = terminated | collided
+        elif self.task.on_collision == "reset" and (count := np.count_nonzero(collided)):
+            self.backend.reset(self._start, None if count == self.num_envs else collided)
+        distance = info["distance"] if "distance" in info else np.full(self.num_envs, np.nan)
+        self.statistics.add(distance, reward, collided)
         return Outcome(observation, reward, terminated, info | {"collided": collided})
 
     def _target(self, action: ArrayLike) -> Floats:

@@ -28,9 +28,11 @@ class EpisodeStatistics:
     )
 
     def __init__(self, num_envs: int) -> None:
-        # A row a name; the rows of means hold sums.
+        # A row a name; the rows of means hold sums, those of steps and collisions count.
         self._values = np.zeros((len(self.NAMES), num_envs))
-        self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:6]
+        self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:8]
+        # One step's distance, reward, step and collision.
+        self._step = np.ones((4, num_envs))
         self.clear(slice(None))
 
     @property
@@ -40,12 +42,10 @@ class EpisodeStatistics:
 
     def add(self, distance: Floats, reward: Floats, collided: NDArray[np.bool_]) -> None:
         """Count one step of every episode; all arrays (N,), distance in m."""
-        values = np.array((distance, reward))
-        np.maximum(self._max, values, out=self._max)
-        np.minimum(self._min, values, out=self._min)
-        self._sum += values
-        self._values[6] += 1.0
-        self._values[7] += collided
+        self._step[0], self._step[1], self._step[3] = distance, reward, collided
+        np.maximum(self._max, self._step[:2], out=self._max)
+        np.minimum(self._min, self._step[:2], out=self._min)
+        self._sum += self._step
 
     def clear(self, chosen: NDArray[np.bool_] | slice) -> None:
         """Begin the chosen episodes anew."""

@@ -65,11 +65,11 @@ class PinocchioBackend(Backend):
         self._touching = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
-        rows = True if mask is None else mask[:, None]
-        np.copyto(self._q, q, where=rows)
-        np.copyto(self._qd, 0.0, where=rows)
-        np.copyto(self._time, 0.0, where=True if mask is None else mask)
-        np.copyto(self._touching, False, where=True if mask is None else mask)
+        rows: Any = slice(None) if mask is None else mask
+        self._q[rows] = q[rows]
+        self._qd[rows] = 0.0
+        self._time[rows] = 0.0
+        self._touching[rows] = False
         self._collided = None
 
     def step(self, q_target: Floats) -> SimState:

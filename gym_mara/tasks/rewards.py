@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+# Constants are arrays here: a ufunc on one row takes a Python number at twice the cost.
+_ONE, _TWO = np.array(1.0), np.array(2.0)
 
 
 def distance_reward(distance: Floats, alpha: float, kappa: float) -> Floats:
@@ -21,26 +23,34 @@ def distance_reward(distance: Floats, alpha: float, kappa: float) -> Floats:
     (e^(-α d) - e^(-α)) / (1 - e^(-α)) + 10 (e^(-α d/κ) - e^(-α/κ)) / (1 - e^(-α/κ)) of d (...,), m.
     """
     # Each summand is an exponential, scaled and shifted to go from its height at 0 m to 0 at 1 m.
-    basin, peak = _decay(alpha, 1.0), _decay(alpha / kappa, 10.0)
-    wide = basin.scale * np.exp(-basin.rate * distance)
-    return wide + peak.scale * np.exp(-peak.rate * distance) - (basin.shift + peak.shift)
-
-
-class _Decay(NamedTuple):
-    rate: float
-    scale: float
-    shift: float
+    (basin, wide), (peak, narrow), shift = _basin_and_peak(alpha, kappa)
+    return basin * np.exp(wide * distance) + peak * np.exp(narrow * distance) - shift
 
 
 @lru_cache(maxsize=64)
-def _decay(rate: float, height: float) -> _Decay:
-    scale = height / -math.expm1(-rate)
-    return _Decay(rate, scale, scale * math.exp(-rate))
+def _basin_and_peak(
+    alpha: float, kappa: float
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats], Floats]:
+    """The scale and the exponent of each summand, and the shift of both."""
+    narrow = alpha / kappa
+    basin, peak = 1.0 / -math.expm1(-alpha), 10.0 / -math.expm1(-narrow)
+    shift = basin * math.exp(-alpha) + peak * math.exp(-narrow)
+    return (
+        (np.array(basin), np.array(-alpha)),
+        (np.array(peak), np.array(-narrow)),
+        np.array(shift),
+    )
 
 
 def orientation_factor(angle: Floats, beta: float, gamma: float) -> Floats:
     """From 1 at angle 0 down to γ / (1 + γ) at π: (1 - (θ/π)^β + γ) / (1 + γ) of θ (...,), rad."""
-    return 1.0 - angle**beta * (np.pi**-beta / (1.0 + gamma))
+    exponent, scale = _bend(beta, gamma)
+    return _ONE - scale * angle**exponent
+
+
+@lru_cache(maxsize=64)
+def _bend(beta: float, gamma: float) -> tuple[Floats, Floats]:
+    return np.array(beta), np.array(np.pi**-beta / (1.0 + gamma))
 
 
 def collision_penalty(
@@ -49,4 +59,10 @@ def collision_penalty(
     """δ (2 min(d, 0.5))^η on a collision, else 0, of d (...,), m."""
     if not np.count_nonzero(collided):
         return np.zeros(np.shape(distance))
-    return collided * (delta * np.minimum(2.0 * distance, 1.0) ** eta)
+    size, exponent = _penalty(delta, eta)
+    return collided * (size * np.minimum(_TWO * distance, _ONE) ** exponent)
+
+
+@lru_cache(maxsize=64)
+def _penalty(delta: float, eta: float) -> tuple[Floats, Floats]:
+    return np.array(delta), np.array(eta)
