@@ -122,7 +122,7 @@ class Simulation:
             raise GymMaraError(
                 "the action holds NaN or infinity; joint targets must be finite (rad)"
             )
-        return np.minimum(np.maximum(target, self.target_low), self.target_high)
+        return target.clip(self.target_low, self.target_high)
 
     def _check_open(self) -> None:
         if self._closed:

@@ -61,6 +61,7 @@ class PinocchioBackend(Backend):
         self._q = np.tile(robot.home, (num_envs, 1))
         self._qd = np.zeros_like(self._q)
         self._time = np.zeros(num_envs)
+        self._period = np.array(self.control_period)  # NumPy adds it faster than a Python number
         self._collided: NDArray[np.bool_] | None = None
         self._touching = np.zeros(num_envs, dtype=np.bool_)
 
@@ -75,11 +76,10 @@ class PinocchioBackend(Backend):
     def step(self, q_target: Floats) -> SimState:
         if self.max_joint_velocity is None:
             self._q[...] = q_target
-            self._qd[...] = 0.0
             self._collided = self._checker.check(self._q)
         else:
             self._travel(q_target, self.max_joint_velocity)
-        self._time += self.control_period
+        self._time += self._period
         return self.state
 
     def _travel(self, q_target: Floats, velocity: float) -> None:

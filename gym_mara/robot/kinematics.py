@@ -34,7 +34,7 @@ class Kinematics:
     def __init__(self, model: pin.Model, ee_frame_id: int) -> None:
         self._model, self._data, self._frame = model, model.createData(), ee_frame_id
         self._tool: Floats = model.frames[ee_frame_id].placement.homogeneous[None]
-        motions = np.array([_motion_axis(joint) for joint in model.joints[1:]])
+        motions = np.array([motion_axis(joint) for joint in model.joints[1:]])
         self.prismatic: NDArray[np.bool_] = np.logical_not(np.any(motions[:, 3:], axis=1))
         """Which joints slide (J,)."""
         self._any_prismatic = bool(self.prismatic.any())
@@ -70,16 +70,16 @@ class Kinematics:
         return product[:, :3, 3].copy(), rotations.from_matrix(product[:, :3, :3])
 
     def _pose_one_by_one(self, q: Floats) -> tuple[Floats, Floats]:
-        positions, quaternions, half_turns = [], [], False
+        poses, half_turns = [], False
         for configuration in q:
             pin.forwardKinematics(self._model, self._data, configuration)
             placement = pin.updateFramePlacement(self._model, self._data, self._frame)
             *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
-            positions.append(position)
-            quaternions.append((w, x, y, z) if w > 0.0 else (-w, -x, -y, -z))
+            poses.append((*position, w, x, y, z) if w > 0.0 else (*position, -w, -x, -y, -z))
             half_turns = half_turns or abs(w) <= rotations.ZERO
-        found = np.array(quaternions)
-        return np.array(positions), rotations.canonical(found) if half_turns else found
+        found = np.array(poses)
+        position, quaternion = found[:, :3], found[:, 3:]
+        return position, rotations.canonical(quaternion) if half_turns else quaternion
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""
@@ -113,7 +113,7 @@ class Kinematics:
         return flat.reshape(joints, count, 4, 4)
 
 
-def _motion_axis(joint: pin.JointModel) -> Floats:
+def motion_axis(joint: pin.JointModel) -> Floats:
     """The motion subspace (6,) of a one-dimensional joint in its own frame: linear part, then angular."""
     data = joint.createData()
     joint.calc(data, np.zeros(joint.idx_q + joint.nq))

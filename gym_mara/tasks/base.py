@@ -31,11 +31,12 @@ class Goal:
 
     @cached_property
     def _inverse(self) -> Floats:
-        return rotations.right_matrix(rotations.conjugate(self.quaternion))
+        # Contiguous: the last bits of a dot product hang on the layout, and a copy's would be another.
+        return np.ascontiguousarray(rotations.right_matrix(rotations.conjugate(self.quaternion)))
 
     def orientation_error(self, quaternion: Floats) -> Floats:
         """q ⊗ conj(goal) (N, 4), w >= 0, of end-effector orientations q (N, 4)."""
-        return rotations.canonical((self._inverse @ quaternion[..., None])[..., 0])
+        return rotations.canonical(np.vecdot(self._inverse, quaternion[..., None, :]))
 
 
 @dataclass(frozen=True)
