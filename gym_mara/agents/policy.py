@@ -10,8 +10,10 @@ from typing import Any
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gym_mara.agents.natural_gaussian import NaturalGaussianPolicy
 from gym_mara.agents.run import replace_folder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.errors import GymMaraError, unknown
@@ -20,6 +22,10 @@ from gym_mara.errors import GymMaraError, unknown
 DAMAGE = (OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, pickle.UnpicklingError)
 
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO}
+POLICY_CLASSES: dict[str, type[ActorCriticPolicy]] = {
+    "mlp": ActorCriticPolicy,
+    "natural": NaturalGaussianPolicy,
+}
 
 
 def algorithm_class(name: str) -> type[OnPolicyAlgorithm]:

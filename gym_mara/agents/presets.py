@@ -17,24 +17,26 @@ class Preset:
     """How an algorithm trains on a task."""
 
     num_envs: int
+    policy: str = "mlp"
+    """The form of the policy, one of `gym_mara.agents.policy.POLICY_CLASSES`."""
     arguments: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the algorithm's class; see the module for values that change."""
     normalise_observation: bool = False
     normalise_reward: bool = False
 
 
-# What an arm does next hangs on its action alone, hence no discounted future (γ = 0). Many arms, a narrow start and a
-# learning rate that falls to zero; the entropy bonus keeps the policy from narrowing before it is on the peak.
+# What an arm does next hangs on its action alone, hence no discounted future (γ = 0). Many arms, short rollouts, a narrow
+# start and a learning rate that falls to zero.
 _PPO_REACH = Preset(
     num_envs=256,
+    policy="natural",
     arguments={
-        "n_steps": 16,
+        "n_steps": 8,
         "batch_size": 1024,
         "n_epochs": 10,
         "gamma": 0.0,
-        "learning_rate": ((0.0, 2e-3), (1.0, 0.0)),
+        "learning_rate": ((0.0, 4e-3), (1.0, 0.0)),
         "clip_range": 0.2,
-        "ent_coef": 0.03,
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
     },
 )

@@ -29,7 +29,7 @@ from gym_mara.agents.callbacks import (
 )
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import DAMAGE, algorithm_class, load_policy
+from gym_mara.agents.policy import DAMAGE, POLICY_CLASSES, algorithm_class, load_policy
 from gym_mara.agents.run import RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError
 
@@ -93,7 +93,8 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    return algorithm_class(algo)("MlpPolicy", wrapped, seed=seed, device="cpu", **arguments)
+    policy = POLICY_CLASSES[preset.policy]
+    return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
 
 
 def use_one_thread() -> None:

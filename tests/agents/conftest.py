@@ -9,7 +9,7 @@ import pytest
 from gym_mara.agents.run import RunConfig, RunFolder
 from gym_mara.agents.train import train
 
-ROLLOUT = 256 * 16
+ROLLOUT = 256 * 8
 """Steps between two updates of the preset."""
 
 

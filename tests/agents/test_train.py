@@ -45,7 +45,7 @@ def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
     path = finished_run.path
     about = json.loads((path / "config.json").read_text())
     assert about["seed"] == 5
-    assert about["preset"]["arguments"]["n_steps"] == 16
+    assert about["preset"]["arguments"]["n_steps"] * about["preset"]["num_envs"] == ROLLOUT
     assert {"gym_mara", "gymnasium", "torch", "pin", "python"} <= about["versions"].keys()
     assert [int(p.name) for p in finished_run.checkpoints()] == [ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
     for folder in (path / "best", path / "last", *finished_run.checkpoints()):
@@ -167,8 +167,9 @@ def test_evaluation_reports_each_metric_of_each_episode(finished_run: RunFolder)
     metrics = evaluate_run(finished_run, episodes=3)
     assert tuple(metrics) == METRICS
     assert all(values.shape == (3,) for values in metrics.values())
-    # Start pose and policy are the same in every episode, and so is what comes of them.
-    assert all(np.ptp(values) == 0.0 for values in metrics.values())
+    # Start pose and policy are the same in every episode, and so, but for rounding, is what comes of them.
+    for name, values in metrics.items():
+        np.testing.assert_allclose(values, values[0], rtol=1e-5, err_msg=name)
     np.testing.assert_allclose(metrics["return"], 2048 * metrics["reward_per_step"], rtol=1e-9)
     summary = spread(metrics)
     assert summary["return"].keys() == {"mean", "std", "min", "max"}

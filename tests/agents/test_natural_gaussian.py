@@ -1,0 +1,108 @@
+"""The Gaussian policy in natural coordinates: torch's own Gaussian as referee, and that moving the coordinates changes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from stable_baselines3 import PPO
+from torch.distributions import MultivariateNormal
+
+from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.natural_gaussian import LEAST_STD, NaturalGaussian, NaturalGaussianPolicy
+
+
+@pytest.fixture
+def distribution() -> NaturalGaussian:
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    log_scale = 0.3 * normal(3, 3)
+    return NaturalGaussian().proba_distribution(
+        normal(5, 3), log_scale + log_scale.T, normal(3), normal(3, 3)
+    )
+
+
+def _referee(distribution: NaturalGaussian) -> MultivariateNormal:
+    scale = distribution.scale
+    return MultivariateNormal(
+        distribution.centre + distribution.mean @ scale.T, covariance_matrix=scale @ scale.T
+    )
+
+
+def test_it_is_the_gaussian_that_its_parameters_say(distribution: NaturalGaussian) -> None:
+    referee = _referee(distribution)
+    actions = referee.sample()
+    expected: torch.Tensor = referee.log_prob(actions)  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(distribution.log_prob(actions), expected)
+    expected = referee.entropy()  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(distribution.entropy(), expected)
+    torch.testing.assert_close(distribution.mode(), referee.mean)
+
+
+def test_samples_have_its_mean_and_covariance(distribution: NaturalGaussian) -> None:
+    torch.manual_seed(0)
+    one = NaturalGaussian().proba_distribution(
+        distribution.mean[:1].expand(200_000, 3),
+        torch.zeros(3, 3, dtype=torch.float64),
+        distribution.centre,
+        distribution.scale,
+    )
+    samples = one.sample()
+    referee = _referee(one)
+    covariance = referee.covariance_matrix[0]
+    torch.testing.assert_close(samples.mean(dim=0), referee.mean[0], rtol=0.0, atol=0.03)
+    torch.testing.assert_close(torch.cov(samples.T), covariance, rtol=0.0, atol=0.1)
+
+
+@pytest.fixture
+def model() -> PPO:
+    env = make_env("MARAOrient-v0", "pinocchio", 16, {})
+    ppo = PPO(NaturalGaussianPolicy, env, n_steps=16, batch_size=64, seed=0, device="cpu")
+    return ppo.learn(16 * 16 * 3)
+
+
+def test_training_shapes_the_covariance_and_moves_the_centre(model: PPO) -> None:
+    policy = model.policy
+    assert isinstance(policy, NaturalGaussianPolicy)
+    assert torch.count_nonzero(policy.centre) == 6
+    assert torch.count_nonzero(policy.factor) == 36
+
+
+def test_moving_the_coordinates_does_not_change_the_policy(model: PPO) -> None:
+    policy = model.policy
+    assert isinstance(policy, NaturalGaussianPolicy)
+    observation = torch.as_tensor(model.env.reset())  # type: ignore[union-attr]
+    with torch.no_grad():
+        policy.log_scale.normal_(std=0.2)
+        actions = policy(observation)[0]
+        before = policy.get_distribution(observation)
+        log_prob, mode = before.log_prob(actions), before.mode()
+        policy.recentre()
+        after = policy.get_distribution(observation)
+    assert torch.count_nonzero(policy.log_scale) == 0
+    torch.testing.assert_close(after.log_prob(actions), log_prob, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(after.mode(), mode, rtol=1e-4, atol=1e-5)
+
+
+def test_the_policy_never_narrows_below_what_float32_resolves(model: PPO) -> None:
+    policy = model.policy
+    assert isinstance(policy, NaturalGaussianPolicy)
+    policy(torch.as_tensor(model.env.reset()))  # type: ignore[union-attr]
+    with torch.no_grad():
+        policy.log_scale.copy_(-40.0 * torch.eye(6))
+    policy.set_training_mode(True)
+    sizes = torch.linalg.svdvals(policy.factor)
+    torch.testing.assert_close(sizes, torch.full((6,), LEAST_STD))
+
+
+def test_it_comes_back_from_disk(model: PPO, tmp_path: Path) -> None:
+    model.save(tmp_path / "model.zip")
+    again = PPO.load(tmp_path / "model.zip", device="cpu")
+    observation: Any = model.env.reset()  # type: ignore[union-attr]
+    expected = model.predict(observation, deterministic=True)[0]
+    assert (again.predict(observation, deterministic=True)[0] == expected).all()
