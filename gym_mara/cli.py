@@ -10,7 +10,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
@@ -124,6 +126,28 @@ def evaluate(
         print(json.dumps(spread(metrics), indent=2))
     else:
         _print_evaluation(folder, backend=backend, episodes=episodes, which=policy)
+
+
+@app.command()
+def transfer(
+    run: Annotated[Path, typer.Argument(help="A run folder.")],
+    episodes: Annotated[int, typer.Option(help="How many episodes to play on each backend.")] = 1,
+    policy: Annotated[str, typer.Option(help="last or best.")] = "last",
+    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+) -> None:
+    """Play a run's policy on every backend, side by side: what it loses between simulations."""
+    with _agents():
+        from gym_mara.agents.run import RunFolder
+        from gym_mara.agents.transfer import transfer as play
+
+    folder = RunFolder.open(run)
+    rows = play(folder, episodes=episodes, which=policy, options=_options(settings))
+    names = ("error, mm", "angle, deg", "return", "collisions", "settled, s", "torque", "rad/s")
+    table = Table("backend", *names, title=f"{folder.config.env}, {policy} policy")
+    for backend, *columns in rows:
+        table.add_row(backend, *(_mean_and_spread(values) for values in columns))
+    _out.print(table)
+    _out.print("torque: the highest of any joint, relative to its limit; rad/s: the highest speed")
 
 
 @app.command("list")
@@ -241,6 +265,13 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
     for name, values in spread(metrics).items():
         table.add_row(_UNITS[name], *(f"{value:.2f}" for value in values.values()))
     _out.print(table)
+
+
+def _mean_and_spread(values: NDArray[np.float64]) -> str:
+    mean, spread = values.mean(), values.std()
+    if np.isnan(mean):
+        return "-"
+    return f"{mean:.2f}" + (f" ± {spread:.2f}" if len(values) > 1 else "")
 
 
 def _task(env: str) -> str:

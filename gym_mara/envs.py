@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
@@ -64,7 +65,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode at the start pose; `options` has no meaning yet."""
         super().reset(seed=seed)
-        return self.simulation.reset()[0], {}
+        observation = self.simulation.reset((self.np_random,))[0]
+        return observation, _info_of_one(self.simulation.backend.report())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move towards the joint targets (J,), rad, for one control period.
@@ -73,11 +75,11 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
         """
         outcome = self.simulation.step(np.asarray(action)[None])
-        info: dict[str, Any] = {name: values.item() for name, values in outcome.info.items()}
+        info = _info_of_one(outcome.info)
         # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
         info["statistics"] = self.simulation.statistics.of(0)
-        terminated = outcome.terminated.item()
-        return outcome.observation[0], outcome.reward.item(), terminated, False, info
+        terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
+        return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
 
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arm, the episode and the random generator; it pickles."""
@@ -141,6 +143,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "autoreset_mode": self.autoreset_mode,
         }
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._generators: tuple[np.random.Generator, ...] = ()  # where episodes are random
         self.closed = False
 
     def reset(
@@ -150,11 +153,14 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         options: dict[str, Any] | None = None,
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin episodes, of all arms or of those that `options["reset_mask"]`, bool (N,), names."""
-        if seed is not None and not isinstance(seed, (int, np.integer)):
+        seeds: Sequence[int | None] = [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + index for index in range(self.num_envs)]
+        elif seed is not None:
             if len(seed) != self.num_envs:
                 raise GymMaraError(f"{len(seed)} seeds for {self.num_envs} environments")
-            seed = seed[0]
-        super().reset(seed=seed)
+            seeds = seed
+        super().reset(seed=seeds[0])
         mask = (options or {}).get("reset_mask")
         if mask is not None:
             mask = np.asarray(mask)
@@ -162,8 +168,20 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 raise GymMaraError(
                     f"reset_mask must be bool, of shape {(self.num_envs,)}, and choose at least one"
                 )
-        self._ended[slice(None) if mask is None else mask] = False
-        return self.simulation.reset(mask), {}
+        chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
+        self._ended[chosen] = False
+        if self.simulation.backend.random:
+            self._seed(seeds, chosen)
+        observation = self.simulation.reset(self._generators, mask)
+        return observation, _vector_info(self.simulation.backend.report(), chosen)
+
+    def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
+        """Give each arm a random generator of its own, the one that a MaraEnv has with the arm's seed."""
+        generators = dict(enumerate(self._generators))
+        for index, seed in enumerate(seeds):
+            if index not in generators or (chosen[index] and seed is not None):
+                generators[index] = np_random(seed)[0]
+        self._generators = tuple(generators[index] for index in range(self.num_envs))
 
     def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
@@ -179,12 +197,16 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         outcome = self.simulation.step(actions)
         observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
         truncated = self.simulation.statistics.steps == self.max_episode_steps
+        if outcome.truncated is not None:
+            truncated |= outcome.truncated
         if resetting.any():  # NEXT_STEP: these began an episode instead of stepping
-            observation[resetting] = self.simulation.reset(resetting)[resetting]
+            observation[resetting] = self._reset(resetting)[resetting]
             reward[resetting] = 0.0
             terminated, truncated = terminated & ~resetting, truncated & ~resetting
         ended = terminated | truncated
         info = _vector_info(outcome.info, ~resetting)
+        if resetting.any():
+            self._report_beginning(info, resetting)
         if ended.any():
             info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -195,16 +217,27 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 info = _vector_info(outcome.info, ~ended)
                 info |= {"final_obs": final, "_final_obs": ended.copy()}
                 info |= _vector_info(final_info, ended)
-                observation[ended] = self.simulation.reset(ended)[ended]
+                observation[ended] = self._reset(ended)[ended]
+                self._report_beginning(info, ended)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended.copy()
         return observation, reward, terminated, truncated, info
 
+    def _reset(self, arms: Mask) -> Floats:
+        return self.simulation.reset(self._generators, arms)
+
+    def _report_beginning(self, info: dict[str, Any], began: Mask) -> None:
+        """Enter what the backend says of arms whose episodes have just begun."""
+        for key, values in self.simulation.backend.report().items():
+            info[key][began] = values[began]
+            info[f"_{key}"][began] = True
+
     def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arms, the episodes and the random generator; it pickles."""
+        """A snapshot of the arms, the episodes and the random generators; it pickles."""
         return self.simulation.save() | {
             "ended": self._ended.copy(),
             "np_random": copy.deepcopy(self.np_random),
+            "generators": copy.deepcopy(self._generators),
         }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
@@ -212,6 +245,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.simulation.restore(snapshot)
         self._ended = snapshot["ended"].copy()
         self.np_random = copy.deepcopy(snapshot["np_random"])
+        self._generators = copy.deepcopy(snapshot["generators"])
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the backend; called by close()."""
@@ -230,6 +264,11 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
         raise unknown("autoreset_mode", mode, [m.value for m in AutoresetMode]) from None
 
 
+def _info_of_one(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """A batch of infos of one arm as plain numbers, arrays and objects."""
+    return {name: v.item() if v.ndim == 1 else v[0] for name, v in values.items()}
+
+
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Gymnasium's form of a batch of infos: a mask `_key` beside each key says which arms it speaks of."""
     info: dict[str, Any] = {}
@@ -238,6 +277,8 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
             nested = {k: v for k, v in value.items() if not k.startswith("_")}
             info[key] = _vector_info(nested, mask)
         else:
-            info[key] = np.where(mask, value, np.zeros((), dtype=value.dtype))
+            rows = mask.reshape(-1, *(1,) * (value.ndim - 1))
+            absent = np.array(None) if value.dtype == object else np.zeros((), value.dtype)
+            info[key] = np.where(rows, value, absent)
         info[f"_{key}"] = mask.copy()
     return info

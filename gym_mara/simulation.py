@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,11 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from gym_mara.backends import make_backend
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotModel
+from gym_mara.state import SimState
 from gym_mara.statistics import EpisodeStatistics
 from gym_mara.tasks import Task, make_task
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Generators = Sequence[np.random.Generator]
 
 
 class Outcome(NamedTuple):
@@ -29,8 +33,10 @@ class Outcome(NamedTuple):
     """(N,)."""
     terminated: Mask
     """(N,)."""
+    truncated: Mask | None
+    """The arms (N,) whose simulation broke down, if any."""
     info: dict[str, NDArray[Any]]
-    """The task's reward terms and `collided`, each (N,)."""
+    """The task's reward terms, `collided`, each (N,), and what the backend reports, (N, …)."""
 
 
 class Simulation:
@@ -68,6 +74,9 @@ class Simulation:
         self._started = False
         self._closed = False
         self.statistics = EpisodeStatistics(self.num_envs)
+        self._kinematics = self.robot.kinematics()
+        # The sensors' noise, from a generator for each arm's episode.
+        self._noise: dict[int, np.random.Generator] = {}
         self.observation_space = self.task.observation_space(
             self.robot, self.goal, self.backend.joint_velocity
         )
@@ -76,13 +85,25 @@ class Simulation:
         self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
         self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
 
-    def reset(self, mask: Mask | None = None) -> Floats:
-        """Begin new episodes, of all arms or of those that the mask (N,) names; the observations (N, O) then."""
+    def reset(self, generators: Generators, mask: Mask | None = None) -> Floats:
+        """Begin new episodes, of all arms or of those that the mask (N,) names; the observations (N, O) then.
+
+        Args:
+            generators: each arm's source of randomness, N of them.
+            mask: the arms.
+        """
         self._check_open()
+        chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
+        if self.backend.random:
+            seeds = np.zeros(self.num_envs, np.uint64)
+            for index in np.flatnonzero(chosen).tolist():
+                seeds[index] = generators[index].integers(2**63)
+                self._noise[index] = np.random.default_rng(seeds[index])
+            self.backend.begin_episodes(seeds, chosen)
         self.backend.reset(self._start, mask)
         self.statistics.clear(slice(None) if mask is None else mask)
         self._started = True
-        return self.task.observe(self.backend.state, self.goal)
+        return self._observe(self.backend.state, chosen)
 
     def step(self, action: ArrayLike) -> Outcome:
         """Move every arm for one control period towards its joint targets (N, J), rad.
@@ -95,7 +116,8 @@ class Simulation:
         if not self._started:
             raise ResetNeeded("call reset() before the first step()")
         state = self.backend.step(self._target(action))
-        observation = self.task.observe(state, self.goal)
+        report = self.backend.report()
+        observation = self._observe(state)
         reward, info = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
@@ -105,7 +127,21 @@ class Simulation:
             self.backend.reset(self._start, None if count == self.num_envs else collided)
         distance = info["distance"] if "distance" in info else np.full(self.num_envs, np.nan)
         self.statistics.add(distance, reward, collided)
-        return Outcome(observation, reward, terminated, info | {"collided": collided})
+        everything = {**info, "collided": collided, **report}
+        return Outcome(observation, reward, terminated, self.backend.diverged, everything)
+
+    def _observe(self, state: SimState, chosen: Mask | None = None) -> Floats:
+        """What the task shows of the states, as the sensors of the arms, or of those chosen, see them."""
+        noise = self.backend.sensor_noise
+        if noise is not None:
+            q = state.q.copy()
+            rows = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
+            for index in rows.tolist():
+                q[index] += noise[index] * self._noise[index].standard_normal(q.shape[1])
+            q = q.clip(self.robot.lower, self.robot.upper)
+            position, quaternion = self._kinematics.pose(q)
+            state = dataclasses.replace(state, q=q, ee_position=position, ee_quaternion=quaternion)
+        return self.task.observe(state, self.goal)
 
     def _target(self, action: ArrayLike) -> Floats:
         """The joint targets that an action asks for, clipped to the action space and the joint limits."""
@@ -133,6 +169,7 @@ class Simulation:
         return {
             "backend": self.backend.save(),
             "statistics": copy.deepcopy(self.statistics),
+            "noise": copy.deepcopy(self._noise),
             "started": self._started,
         }
 
@@ -141,6 +178,7 @@ class Simulation:
         self._check_open()
         self.backend.restore(snapshot["backend"])
         self.statistics = copy.deepcopy(snapshot["statistics"])
+        self._noise = copy.deepcopy(snapshot["noise"])
         self._started = snapshot["started"]
 
     def close(self) -> None:

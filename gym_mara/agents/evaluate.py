@@ -13,14 +13,21 @@ from stable_baselines3.common.vec_env import VecNormalize
 from gym_mara.agents.policy import load_policy
 from gym_mara.agents.run import RunFolder
 from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
 
+MAX_EPISODE_STEPS = 2048
+"""The length of an episode of the registered environments."""
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
 
 def make_env(
-    task: str, backend: str, num_envs: int, options: dict[str, Any], max_episode_steps: int = 2048
+    task: str,
+    backend: str,
+    num_envs: int,
+    options: dict[str, Any],
+    max_episode_steps: int | None = MAX_EPISODE_STEPS,
 ) -> MaraVecEnv:
     """N arms of a task for Stable-Baselines3."""
     env = MaraVectorEnv(
@@ -53,8 +60,11 @@ def evaluate_run(
     """
     if episodes < 1:
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
-    config = run.config
-    env = make_env(config.env, backend or config.backend, episodes, config.env_options)
+    config, options = run.config, run.config.env_options
+    if backend not in (None, config.backend):  # the settings of one backend mean nothing to another
+        own = backend_settings(config.backend)
+        options = {name: value for name, value in options.items() if name not in own}
+    env = make_env(config.env, backend or config.backend, episodes, options)
     try:
         return evaluate_policy_folder(run.policy(which), config.algo, env, config.seed)
     finally:

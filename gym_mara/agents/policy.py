@@ -64,9 +64,19 @@ def load_policy(
     try:
         wrapped = VecNormalize.load(str(folder / "normalisation.pkl"), env)
         wrapped.training = training
+        # To act it needs no environment, and may come from one whose joints are faster or slower.
         model = algorithm_class(algo).load(
-            folder / "model.zip", env=wrapped, device="cpu", force_reset=False
+            folder / "model.zip",
+            env=wrapped if training else None,
+            device="cpu",
+            force_reset=False,
         )
+        for mine, theirs in (
+            (model.observation_space, env.observation_space),
+            (model.action_space, env.action_space),
+        ):
+            if mine.shape != theirs.shape:
+                raise ValueError(f"the policy's space is {mine}, the environment's {theirs}")
     except GymMaraError:
         raise
     except DAMAGE as error:

@@ -57,12 +57,17 @@ class MaraVecEnv(VecEnv):
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
+    def targets(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        """The joint targets (N, J), rad, that actions (N, J) in [-1, 1] stand for."""
+        span = 0.5 * (self._high - self._low)
+        return self._low + span * (np.asarray(actions, np.float64) + 1.0)
+
     def step_wait(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        span = 0.5 * (self._high - self._low)
-        targets = self._low + span * (np.asarray(self._actions, np.float64) + 1.0)
-        observation, reward, terminated, truncated, info = self.env.step(targets)
+        observation, reward, terminated, truncated, info = self.env.step(
+            self.targets(self._actions)
+        )
         self._returns += reward
         self.reward_sum += float(reward.sum())
         done = terminated | truncated
@@ -118,5 +123,6 @@ class MaraVecEnv(VecEnv):
 
 
 def _at(values: dict[str, Any], index: int) -> dict[str, Any]:
-    """One arm's part of a batch of infos, as plain numbers."""
-    return {k: v[index].item() for k, v in values.items() if not k.startswith("_")}
+    """One arm's part of a batch of infos, as plain numbers, arrays and objects."""
+    own = {k: v[index] for k, v in values.items() if not k.startswith("_")}
+    return {k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()}

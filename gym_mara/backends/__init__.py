@@ -8,6 +8,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from gym_mara.backends.base import Backend
+from gym_mara.backends.workers import WorkerBackend, choose_workers
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
 
@@ -16,6 +17,7 @@ __all__ = ["Backend", "backend_names", "make_backend"]
 # Imported when first used: "module:class".
 _BACKENDS = {
     "pinocchio": "gym_mara.backends.pinocchio:PinocchioBackend",
+    "dart": "gym_mara.backends.dart:DartBackend",
 }
 
 
@@ -44,6 +46,19 @@ def backend_class(name: str) -> type[Backend]:
     return backend
 
 
+def backend_settings(name: str) -> list[str]:
+    """The keyword arguments of the backend of this name.
+
+    Raises:
+        GymMaraError: no backend has this name.
+        MissingExtraError: its engine is not installed.
+    """
+    backend = backend_class(name)
+    parameters = inspect.signature(backend).parameters.values()
+    settings = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    return settings + ["workers"] * backend.in_processes
+
+
 def make_backend(name: str, robot: RobotModel, num_envs: int, options: dict[str, Any]) -> Backend:
     """A backend of this name for N arms, with settings of its own.
 
@@ -51,13 +66,17 @@ def make_backend(name: str, robot: RobotModel, num_envs: int, options: dict[str,
         GymMaraError: the name or a setting is unknown, or a setting is out of its range.
         MissingExtraError: its engine is not installed.
     """
-    backend = backend_class(name)
-    parameters = inspect.signature(backend).parameters.values()
-    settings = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    backend, settings = backend_class(name), backend_settings(name)
     for option in options:
         if option not in settings:
             raise GymMaraError(
                 f"unknown keyword argument {option!r}: it is neither the task's nor backend "
                 f"{name!r}'s, whose settings are: {', '.join(sorted(settings))}"
             )
-    return backend(robot, num_envs, **options)
+    if not backend.in_processes:
+        return backend(robot, num_envs, **options)
+    options = dict(options)
+    workers = choose_workers(num_envs, options.pop("workers", None))
+    if workers == 1:
+        return backend(robot, num_envs, **options)
+    return WorkerBackend(backend, robot, num_envs, workers, options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,13 @@ class Backend(ABC):
     finite, of shape (N, J) and within the joint limits. What `state` returns is never changed afterwards.
     A backend pickles and deep-copies with its state.
     """
+
+    in_processes: ClassVar[bool] = False
+    """Whether many arms go faster spread over processes: for an engine that holds Python's lock while it steps."""
+    random: bool = False
+    """Whether episodes differ; if so `begin_episodes` is called before each."""
+    diverged: NDArray[np.bool_] | None = None
+    """The arms (N,) that the engine lost in the last step, if any: their state is the one before, their episode over."""
 
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
         self.robot = robot
@@ -42,6 +49,18 @@ class Backend(ABC):
     @abstractmethod
     def state(self) -> SimState:
         """The state now; right after a reset `collided` tells whether links touch at q."""
+
+    def begin_episodes(self, seeds: NDArray[np.uint64], mask: NDArray[np.bool_]) -> None:  # noqa: B027
+        """Draw what is random about the episodes of the arms that the mask (N,) names, from a seed for each (N,)."""
+
+    @property
+    def sensor_noise(self) -> Floats | None:
+        """The standard deviation of each arm's measured joint positions (N,), rad, if there is any."""
+        return None
+
+    def report(self) -> dict[str, NDArray[Any]]:
+        """What `info` says of the arms beyond their state, each (N, …)."""
+        return {}
 
     @abstractmethod
     def save(self) -> dict[str, Any]:

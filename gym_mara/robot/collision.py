@@ -64,12 +64,22 @@ class CoalChecker(CollisionChecker):
     """Coal, FCL's successor that Pinocchio ships, one configuration at a time.
 
     Its plainest broad phase is the fastest here: an arm has too few bodies for a tree of their boxes to pay.
+
+    Args:
+        robot: the arm.
+        displacement: how far each joint may move (J,), rad: pairs count as touching that could meet while none moves
+            further. None for pairs that touch.
     """
 
-    def __init__(self, robot: RobotModel) -> None:
+    def __init__(self, robot: RobotModel, displacement: NDArray[np.float64] | None = None) -> None:
         super().__init__(robot)
+        self._displacement = displacement
         # The manager refers to what it is given, and does not keep it alive.
         self._data, self._geometry_data = robot.model.createData(), robot.geometry.createData()
+        if displacement is not None:
+            margins = approach_bounds(robot, displacement).tolist()
+            for request, margin in zip(self._geometry_data.collisionRequests, margins, strict=True):
+                request.security_margin = margin
         self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
             robot.model, robot.geometry, self._geometry_data
         )
@@ -82,6 +92,26 @@ class CoalChecker(CollisionChecker):
             pin.computeCollisions,
         )
         return np.array([check(model, data, manager, row, True) for row in q], dtype=np.bool_)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.robot, self._displacement)
+
+
+def approach_bounds(robot: RobotModel, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much nearer the two ends of each collision pair can come (P,), m, while joints move by `displacement` (J,), rad.
+
+    Seen from one end, only the joints between the two move the other.
+    """
+    model, objects = robot.model, robot.geometry.geometryObjects
+    joints_to: list[frozenset[int]] = [frozenset()]
+    for body in range(1, model.njoints):
+        joints_to.append(joints_to[model.parents[body]] | {body - 1})
+    length = robot.reach * displacement
+    bounds = []
+    for pair in robot.geometry.collisionPairs:
+        one, other = (joints_to[objects[end].parentJoint] for end in (pair.first, pair.second))
+        bounds.append(length[sorted(one ^ other)].sum())
+    return np.array(bounds)
 
 
 class ParallelCoalChecker(CollisionChecker):

@@ -83,6 +83,8 @@ class Kinematics:
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""
+        if len(q) < BATCH_FROM:
+            return np.array([self._velocity_of_one(*row) for row in zip(q, qd, strict=True)])
         frames = self._local_transforms(q).copy()
         for joint in range(1, len(frames)):
             frames[joint] = frames[joint - 1] @ frames[joint]
@@ -91,6 +93,13 @@ class Kinematics:
         turning = np.cross(axes, tool - frames[:, :, :3, 3])
         columns = np.where(self.prismatic[:, None, None], axes, turning)
         return (columns * qd.T[:, :, None]).sum(axis=0)
+
+    def _velocity_of_one(self, q: Floats, qd: Floats) -> Floats:
+        pin.forwardKinematics(self._model, self._data, q, qd)
+        pin.updateFramePlacement(self._model, self._data, self._frame)
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        velocity: Floats = pin.getFrameVelocity(self._model, self._data, self._frame, frame).linear
+        return velocity
 
     def _local_transforms(self, q: Floats) -> Floats:
         """Each joint's transform in its parent's frame (J, N, 4, 4); overwritten by the next call.

@@ -1,0 +1,178 @@
+"""What the dynamic backend costs, beside the physics it contains and beside peers, and how well it keeps energy; prints Markdown."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+from speed import PEERS, batch, rates, row, single
+
+import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.backends.dart import DartBackend
+from gym_mara.backends.dart_arm import DartArm
+from gym_mara.robot import RobotModel
+
+ENV_ID = "gym_mara/MARACollisionOrient-v0"
+
+
+def bare_steps(actions: Any) -> Callable[[], int]:
+    """DART's own world.step() over the arm's way in `dynamic`: the same states, commands and number of calls."""
+    env = gymnasium.make(ENV_ID, backend="dart")
+    backend = env.unwrapped.simulation.backend  # type: ignore[attr-defined]
+    assert isinstance(backend, DartBackend)
+    moved, run_on = backend.arms[0], backend.arms[0].run
+    periods = []
+
+    def record(velocities: Any) -> Any:
+        periods.append((moved.q, moved.qd, velocities))
+        return run_on(velocities)
+
+    moved.run = record  # type: ignore[method-assign]
+    env.reset(seed=0)
+    for action in actions:
+        env.step(action)
+    arm = DartArm(RobotModel.load("mara"))
+
+    def run() -> int:
+        command, step = arm.skeleton.setCommands, arm.world.step
+        for q, qd, velocities in periods:
+            arm.set_state(q, qd)
+            for velocity in velocities:
+                command(velocity)
+                step()
+        return len(periods)
+
+    return run
+
+
+def dynamic(env_id: str = ENV_ID, **options: Any) -> Callable[[], int]:
+    """Steps of one dynamic environment through gymnasium.make, with random actions."""
+    return single(env_id, backend="dart", **options)
+
+
+def print_step() -> None:
+    """One environment beside the bare physics that its steps contain."""
+    env = gymnasium.make(ENV_ID, backend="dart")
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(200)]
+    measured = rates({"bare": bare_steps(actions), "env": dynamic()})
+    print("\n## One dynamic environment, beside the world.step() calls it contains\n")
+    row("what", "steps per second", "time, relative")
+    row("---", "---", "---")
+    row("bare world.step(), 20 a step", f"{measured['bare']:,.0f}", "1.00")
+    ratio = measured["bare"] / measured["env"]
+    row(f"{ENV_ID}, backend='dart'", f"{measured['env']:,.0f}", f"{ratio:.2f}")
+
+
+def print_workers() -> None:
+    """The same arms in one process and in two."""
+    functions = {
+        str(workers): batch(ENV_ID, 64, backend="dart", workers=workers) for workers in (1, 2)
+    }
+    measured = rates(functions)
+    print("\n## 64 arms in worker processes\n")
+    row("workers", "steps per second", "relative")
+    row("---", "---", "---")
+    for workers, rate in measured.items():
+        row(workers, f"{rate:,.0f}", f"{rate / measured['1']:.2f}")
+
+
+def print_peers() -> None:
+    """One dynamic environment beside the peers that are installed."""
+    functions = {f"{ENV_ID}, backend='dart'": dynamic()}
+    for module, env_id in PEERS.items():
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                gymnasium.register_envs(__import__(module))
+                functions[env_id] = single(env_id)
+        except Exception as error:
+            print(f"\n{env_id} cannot run here: {type(error).__name__} {error}")
+    measured = rates(functions)
+    ours = next(iter(measured.values()))
+    print("\n## One dynamic environment beside its peers\n")
+    row("environment", "steps per second", "ours is faster by")
+    row("---", "---", "---")
+    for name, rate in measured.items():
+        row(name, f"{rate:,.0f}", f"{ours / rate:.2f}")
+
+
+def _memory(count: int, queue: Any) -> None:
+    """How much memory a process with so many environments takes at most, MB."""
+    envs = [gymnasium.make(ENV_ID, backend="dart") for _ in range(count)]
+    for env in envs:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    queue.put(peak / (2**20 if sys.platform == "darwin" else 2**10))
+
+
+def print_memory() -> None:
+    """What an environment more takes."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    used = []
+    for count in (1, 11):
+        process = context.Process(target=_memory, args=(count, queue))
+        process.start()
+        used.append(queue.get())
+        process.join()
+    print(
+        f"\nMemory: {used[0]:.0f} MB with one environment, {(used[1] - used[0]) / 10:.1f} MB for each more"
+    )
+
+
+def print_energy() -> None:
+    """How the energy of a limp arm drifts over 10 s, in free space."""
+    print("\n## Energy drift of a limp arm over 10 s, without contact or friction\n")
+    row(
+        "start",
+        "physics step, ms",
+        "largest kinetic energy, J",
+        "largest drift, J",
+        "within the first second, J",
+    )
+    row(*["---"] * 5)
+    robot = RobotModel.load("mara")
+    starts = {
+        "hanging, nearly": (0.3, 2.6, 0.3, 0.2, 0.3, 0.0),
+        "upright, nearly": (0.5, 1.0, 0.5, 0.3, -0.5, 0.0),
+    }
+    for name, start in starts.items():
+        for step in (1e-3, 1e-4):
+            arm = DartArm(robot, step, None, servo=False)
+            arm.reset(np.array(start))
+            kinetic, total = energies(arm, 10.0)
+            drift = np.abs(total - total[0])
+            first = drift[: round(1.0 / step)].max()
+            row(
+                name,
+                f"{1000 * step:g}",
+                f"{kinetic.max():.1f}",
+                f"{drift.max():.2f}",
+                f"{first:.2f}",
+            )
+
+
+def energies(arm: DartArm, seconds: float) -> tuple[Any, Any]:
+    """The kinetic and the total energy of an arm that moves by itself, at each physics step, J."""
+    kinetic, potential = [], []
+    for _ in range(round(seconds / arm.physics_step)):
+        arm.world.step()
+        kinetic.append(arm.skeleton.computeKineticEnergy())
+        potential.append(arm.skeleton.computePotentialEnergy())
+    return np.array(kinetic), np.array(kinetic) + np.array(potential)
+
+
+if __name__ == "__main__":
+    print_step()
+    print_workers()
+    print_peers()
+    print_memory()
+    print_energy()

@@ -1,0 +1,330 @@
+"""One arm in a DART world of its own: built from a RobotModel, moved by velocity servos, and what it touches."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.robot import RobotModel
+from gym_mara.robot.collision import CoalChecker, NoChecker
+from gym_mara.robot.kinematics import motion_axis
+
+try:
+    import dartpy as dart
+except ImportError as error:
+    raise MissingExtraError("the backend 'dart'", "dartpy", "dart") from error
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.81
+"""m/s², downwards."""
+DETECTORS = {
+    "fcl": "FCLCollisionDetector",
+    "dart": "DARTCollisionDetector",
+    "bullet": "BulletCollisionDetector",
+    "ode": "OdeCollisionDetector",
+}
+ABSURD = 1e3
+"""A joint this many times as fast as its limit is no longer simulated."""
+LOOK_AHEAD = 0.01
+"""For how long ahead contacts are ruled out at a time, s."""
+# DART wants a mass for every body, also for links that are welded to one that has the mass of both, kg and kg·m².
+_NO_MASS = 1e-9
+
+
+class Contact(NamedTuple):
+    """Two links in touch."""
+
+    links: tuple[str, str]
+    """In alphabetical order."""
+    depth: float
+    """How deep they are in each other at their deepest, m."""
+
+
+class DartArm:
+    """A robot on its base, in a world with gravity.
+
+    Args:
+        robot: the arm.
+        physics_step: s.
+        detector: the collision detector, one of DETECTORS; None for a world without collisions.
+        velocity_limit: of the joints (J,), rad/s; None for the robot's.
+        servo: whether motors hold the joints; without them the arm falls.
+
+    Raises:
+        GymMaraError: there is no such detector, or it does not know a shape of the robot.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        physics_step: float = 1e-3,
+        detector: str | None = "fcl",
+        *,
+        velocity_limit: Floats | None = None,
+        servo: bool = True,
+    ) -> None:
+        self.robot = robot
+        self.physics_step = physics_step
+        self.skeleton = dart.dynamics.Skeleton(robot.name)
+        self.bodies = self._build_bodies()
+        self._joints = [body.getParentJoint() for body in self.bodies[1:]]
+        speed = robot.velocity_limit if velocity_limit is None else velocity_limit
+        if servo:
+            for joint in self._joints:
+                joint.setActuatorType(dart.dynamics.SERVO)
+            self.set_parameters()
+        if detector is not None:
+            self._build_shapes()
+        self.world = _world(physics_step, detector or "fcl")
+        self.world.addSkeleton(self.skeleton)
+        self._forbid_contacts()
+        # The same arm in a world that does not look for contacts, which is most of what a step costs.
+        self._free_world = _world(physics_step, detector or "fcl")
+        self._free_world.addSkeleton(self.skeleton)
+        for world in (self.world, self._free_world):
+            world.getConstraintSolver().getCollisionGroup().setAutomaticUpdate(False)
+        self._free_world.getConstraintSolver().getCollisionGroup().removeAllShapeFrames()
+        self._block = max(1, round(LOOK_AHEAD / physics_step))
+        self._fastest = 1.05 * speed
+        within_block = 1.25 * speed * self._block * physics_step
+        self._clearance = CoalChecker(robot, within_block) if detector else NoChecker(robot)
+
+    def _build_bodies(self) -> list[Any]:
+        """A body for the base and one for each joint, in Pinocchio's order and frames."""
+        model = self.robot.model
+        bodies = [self.skeleton.createWeldJointAndBodyNodePair()[1]]
+        _set_inertia(bodies[0], pin.Inertia(1.0, np.zeros(3), np.eye(3)))
+        for number in range(1, model.njoints):
+            linear, angular = np.split(motion_axis(model.joints[number]), 2)
+            parent = bodies[model.parents[number]]
+            if angular.any():
+                properties = dart.dynamics.RevoluteJointProperties()
+                create = parent.createRevoluteJointAndBodyNodePair
+            else:
+                properties = dart.dynamics.PrismaticJointProperties()
+                create = parent.createPrismaticJointAndBodyNodePair
+            properties.mName = model.names[number]
+            properties.mAxis = angular if angular.any() else linear
+            properties.mT_ParentBodyToJoint = _isometry(model.jointPlacements[number])
+            joint, body = create(properties)
+            joint.setDampingCoefficient(0, model.damping[number - 1])
+            _set_inertia(body, model.inertias[number])
+            bodies.append(body)
+        return bodies
+
+    def _build_shapes(self) -> None:
+        """The shapes of every link, on a body that bears the link's name."""
+        links: dict[str, Any] = {}
+        unnamed = dict(enumerate(self.bodies))
+        for index, geometry_object in enumerate(self.robot.geometry.geometryObjects):
+            link, number = self.robot.link_of(index), geometry_object.parentJoint
+            if link not in links:
+                # The first link on a joint is its body; others are welded to it, to tell their contacts apart.
+                body = unnamed.pop(number, None)
+                if body is None:
+                    body = self.bodies[number].createWeldJointAndBodyNodePair()[1]
+                    _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
+                body.setName(link)
+                links[link] = body
+            node = links[link].createShapeNode(_shape(geometry_object))
+            node.createCollisionAspect()
+            node.createDynamicsAspect()
+            node.setRelativeTransform(_isometry(geometry_object.placement))
+        self.skeleton.enableSelfCollisionCheck()
+        self.skeleton.enableAdjacentBodyCheck()
+
+    def _forbid_contacts(self) -> None:
+        """Ignore the pairs of links that the robot says may not collide."""
+        self._option = self.world.getConstraintSolver().getCollisionOption()
+        named = [b for b in self.skeleton.getBodyNodes() if b.getNumShapeNodes()]
+        for index, one in enumerate(named):
+            for other in named[:index]:
+                pair = frozenset((one.getName(), other.getName()))
+                if pair not in self.robot.collision_pairs:
+                    self._option.collisionFilter.addBodyNodePairToBlackList(one, other)
+
+    def set_parameters(
+        self,
+        mass: Floats | float = 1.0,
+        effort_limit: Floats | float = 1.0,
+        joint_friction: Floats | float | None = None,
+        contact_friction: float = 1.0,
+    ) -> None:
+        """Make this arm differ from its model.
+
+        Args:
+            mass: scale of the mass and inertia that each joint carries (J,).
+            effort_limit: scale of each motor's limit (J,).
+            joint_friction: Coulomb friction of each joint (J,), Nm; None for the URDF's.
+            contact_friction: coefficient of friction of all surfaces.
+        """
+        model, count = self.robot.model, self.robot.num_joints
+        friction = model.friction if joint_friction is None else joint_friction
+        effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
+        mass, friction = np.broadcast_to(mass, count), np.broadcast_to(friction, count)
+        for index, (joint, body) in enumerate(zip(self._joints, self.bodies[1:], strict=True)):
+            joint.setForceLowerLimit(0, -effort[index])
+            joint.setForceUpperLimit(0, effort[index])
+            joint.setCoulombFriction(0, friction[index])
+            own = model.inertias[index + 1]
+            scale = mass[index]
+            _set_inertia(body, pin.Inertia(scale * own.mass, own.lever, scale * own.inertia))
+        for body in self.skeleton.getBodyNodes():
+            for shape in body.getShapeNodes():
+                shape.getDynamicsAspect().setFrictionCoeff(float(contact_friction))
+
+    def reset(self, q: Floats) -> None:
+        """Put the arm at rest at q (J,), rad."""
+        self.set_state(q, np.zeros_like(q))
+
+    def set_state(self, q: Floats, qd: Floats) -> None:
+        """Put the arm at q, rad, with velocities qd, rad/s; both (J,)."""
+        self.skeleton.setPositions(q)
+        self.skeleton.setVelocities(qd)
+        self.skeleton.resetAccelerations()
+        self.skeleton.resetCommands()
+        self.skeleton.clearConstraintImpulses()
+
+    @property
+    def q(self) -> Floats:
+        """Joint positions (J,), rad."""
+        return np.asarray(self.skeleton.getPositions())
+
+    @property
+    def qd(self) -> Floats:
+        """Joint velocities (J,), rad/s."""
+        return np.asarray(self.skeleton.getVelocities())
+
+    @property
+    def torque(self) -> Floats:
+        """What the motors exerted in the last physics step (J,), Nm."""
+        return (
+            np.array([joint.getConstraintImpulse(0) for joint in self._joints]) / self.physics_step
+        )
+
+    def run(self, velocities: Floats) -> list[Contact]:
+        """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts at any of them.
+
+        Contacts are only looked for in a block of steps in which some could come about. No joint is faster in it than
+        1.25 times its limit: it starts with no more than 1.05, and gravity, should a motor be too weak to hold against
+        it, adds little in a time this short.
+        """
+        deepest: dict[tuple[str, str], float] = {}
+        for start in range(0, len(velocities), self._block):
+            block = velocities[start : start + self._block]
+            if self.may_touch():
+                if self.lost():
+                    break
+                self._run_with_contacts(block, deepest)
+            else:
+                command, step = self.skeleton.setCommands, self._free_world.step
+                for velocity in block:
+                    command(velocity)
+                    step()
+        return [Contact(links, depth) for links, depth in sorted(deepest.items())]
+
+    def contacts(self) -> list[Contact]:
+        """What touches now."""
+        deepest: dict[tuple[str, str], float] = {}
+        self._run_with_contacts(np.empty((0, 0)), deepest)
+        return [Contact(links, depth) for links, depth in sorted(deepest.items())]
+
+    def may_touch(self) -> bool:
+        """Whether anything could touch within a block of steps from now."""
+        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
+        return bool(not slow or self._clearance.check(q[None])[0])
+
+    def lost(self) -> bool:
+        """Whether the arm's state has become absurd: not finite, or thrown about by numerical errors."""
+        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        sane = np.isfinite(q) & (np.abs(qd) < ABSURD * self._fastest)
+        return not sane.all()
+
+    def _run_with_contacts(self, velocities: Floats, deepest: dict[tuple[str, str], float]) -> None:
+        # Detectors remember where shapes have been, and report contacts in an order that hangs on it, with which the
+        # solver's last bits change. Afresh, what follows hangs on the arm's state alone, and can be repeated from it.
+        group = self.world.getConstraintSolver().getCollisionGroup()
+        group.removeAllShapeFrames()
+        group.addShapeFramesOf(self.skeleton)
+        command, step = self.skeleton.setCommands, self.world.step
+        result = self.world.getLastCollisionResult
+        for velocity in velocities:
+            command(velocity)
+            step()
+            found = result()
+            if found.isCollision():
+                _note(found, deepest)
+        # A step looks for contacts before it moves: those of the last one are still unseen.
+        if self.world.checkCollision(self._option, found := dart.collision.CollisionResult()):
+            _note(found, deepest)
+
+
+def _world(physics_step: float, detector: str) -> Any:
+    """An empty world with gravity."""
+    if detector not in DETECTORS:
+        raise unknown("detector", detector, DETECTORS)
+    world = dart.simulation.World()
+    world.setTimeStep(physics_step)
+    world.setGravity([0.0, 0.0, -GRAVITY])
+    world.setCollisionDetector(getattr(dart.collision, DETECTORS[detector])())
+    # An arm at rest must not be put to sleep: it would no longer feel small commands.
+    deactivation = world.getDeactivationOptions()
+    deactivation.mEnabled = False
+    world.setDeactivationOptions(deactivation)
+    return world
+
+
+def _note(result: Any, deepest: dict[tuple[str, str], float]) -> None:
+    """Enter the contacts of a result, each pair of links at its deepest."""
+    for contact in result.getContacts():
+        ends = (contact.collisionObject1, contact.collisionObject2)
+        one, other = sorted(e.getShapeFrame().asShapeNode().getBodyNode().getName() for e in ends)
+        depth = float(contact.penetrationDepth)
+        deepest[one, other] = max(depth, deepest.get((one, other), 0.0))
+
+
+def _isometry(placement: pin.SE3) -> Any:
+    return dart.math.Isometry3(placement.homogeneous)
+
+
+def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
+    body.setInertia(dart.dynamics.Inertia(inertia.mass, inertia.lever, inertia.inertia))
+
+
+def _shape(geometry_object: pin.GeometryObject) -> Any:
+    """DART's shape of one of Pinocchio's geometry objects."""
+    shape = geometry_object.geometry
+    kind = type(shape).__name__
+    if kind == "Box":
+        return dart.dynamics.BoxShape(2.0 * shape.halfSide)
+    if kind == "Cylinder":
+        return dart.dynamics.CylinderShape(shape.radius, 2.0 * shape.halfLength)
+    if kind == "Capsule":
+        return dart.dynamics.CapsuleShape(shape.radius, 2.0 * shape.halfLength)
+    if kind == "Sphere":
+        return dart.dynamics.SphereShape(shape.radius)
+    if kind.startswith("BVHModel"):
+        return _mesh(geometry_object.meshPath, geometry_object.meshScale)
+    raise GymMaraError(
+        f"the backend 'dart' does not know the shape {kind} of {geometry_object.name!r}"
+    )
+
+
+def _mesh(path: str, scale: Floats) -> Any:
+    """A mesh from a file; DART reads one only as a part of a URDF."""
+    sizes = " ".join(repr(float(value)) for value in scale)
+    urdf = (
+        f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(path)} '
+        f'scale="{sizes}"/></geometry></collision></link></robot>'
+    )
+    skeleton = dart.utils.DartLoader().parseSkeletonString(urdf, "")
+    if skeleton is None:
+        raise GymMaraError(f"DART cannot read the mesh {path!r}")
+    return skeleton.getBodyNode(0).getShapeNode(0).getShape()

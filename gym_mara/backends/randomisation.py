@@ -1,0 +1,78 @@
+"""What differs from one arm to the next: ranges of physical parameters, drawn anew for every episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.robot import RobotModel
+
+Floats = NDArray[np.float64]
+
+
+class _Parameter(NamedTuple):
+    nominal: float
+    per_joint: bool = False
+    positive: bool = False
+
+
+# Scales have no unit; a joint's mass is that of the links it carries up to the next joint.
+PARAMETERS = {
+    "mass": _Parameter(1.0, per_joint=True, positive=True),  # scale of mass and inertia
+    "effort_limit": _Parameter(1.0, per_joint=True, positive=True),  # scale
+    "servo_gain": _Parameter(1.0, per_joint=True, positive=True),  # scale
+    "joint_friction": _Parameter(0.0, per_joint=True),  # Coulomb friction, Nm
+    "contact_friction": _Parameter(1.0),  # coefficient
+    "latency": _Parameter(0.0),  # s, from a command to its effect
+    "sensor_noise": _Parameter(0.0),  # standard deviation of each measured joint position, rad
+}
+
+
+class Randomisation:
+    """Uniform ranges, from which an arm's parameters are drawn.
+
+    Args:
+        ranges: name → (lowest, highest); the names are those of PARAMETERS.
+        robot: the arm.
+
+    Raises:
+        GymMaraError: a name is unknown, or a range is out of order or out of its bounds.
+    """
+
+    def __init__(self, ranges: Mapping[str, Sequence[float]], robot: RobotModel) -> None:
+        self.ranges = {name: _checked(name, ends) for name, ends in sorted(ranges.items())}
+        self._num_joints = robot.num_joints
+
+    def draw(self, seed: int) -> dict[str, Floats]:
+        """The parameters of one arm: (J,) where each joint has its own, else ()."""
+        generator = np.random.default_rng(seed)
+        return {
+            name: generator.uniform(*self.ranges[name], self._size(name)) for name in self.ranges
+        }
+
+    def nominal(self) -> dict[str, Floats]:
+        """The same parameters, as they are for an arm before its first episode."""
+        return {name: np.full(self._size(name), PARAMETERS[name].nominal) for name in self.ranges}
+
+    def _size(self, name: str) -> tuple[int, ...]:
+        return (self._num_joints,) if PARAMETERS[name].per_joint else ()
+
+
+def _checked(name: str, ends: Any) -> tuple[float, float]:
+    if name not in PARAMETERS:
+        raise unknown("parameter of randomisation", name, PARAMETERS)
+    try:
+        low, high = (float(end) for end in ends)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    positive = PARAMETERS[name].positive
+    if not (0.0 <= low <= high < np.inf) or (positive and low == 0.0):
+        raise GymMaraError(
+            f"randomisation of {name!r} must be (lowest, highest), in this order, finite and "
+            f"{'positive' if positive else 'not negative'}; not {ends!r}"
+        )
+    return low, high

@@ -1,0 +1,35 @@
+"""The position servo of a joint, planned ahead: where it lets the joint be at each moment of a control period."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def servo_motion(
+    q: Floats, q_target: Floats, gain: Floats, velocity_limit: Floats, time: NDArray[Any]
+) -> Floats:
+    """How far joints have moved at `time` under the law q̇ = clip(gain · (q_target - q), ±velocity_limit).
+
+    At full velocity up to the point where the law asks for less, then exponentially: it never overshoots.
+
+    Args:
+        q, q_target: positions now and wanted (..., J), rad.
+        gain: 1/s, (..., J).
+        velocity_limit: rad/s, (..., J).
+        time: since now, s; broadcasts against the others.
+
+    Returns:
+        The displacements, rad, of the broadcast shape.
+    """
+    way = q_target - q
+    slow_zone = velocity_limit / gain  # within this distance the law asks for less than the limit
+    distance = np.abs(way)
+    fast_time = np.maximum(distance - slow_zone, 0.0) / velocity_limit
+    fast = np.minimum(time, fast_time) * velocity_limit
+    slow = np.minimum(distance, slow_zone) * -np.expm1(-gain * np.maximum(time - fast_time, 0.0))
+    return np.copysign(fast + slow, way)

@@ -1,0 +1,263 @@
+"""The dynamic backend: Pinocchio as referee of its motion, Coal of its contacts, and what its motors can do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from gym_mara.backends import make_backend
+from gym_mara.backends.dart import DartBackend, SimulationDivergedError
+from gym_mara.backends.dart_arm import DETECTORS, DartArm
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.robot.collision import approach_bounds, make_checker
+from tests.helpers import COLLIDING_Q, Floats, uniform_q
+
+# In reach without touching anything on the way from home.
+FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
+
+
+def _run(backend: DartBackend, target: Floats, steps: int) -> tuple[Floats, Floats]:
+    """Positions and torques (steps, J) of one arm on its way to a target."""
+    positions, torques = [], []
+    for _ in range(steps):
+        state = backend.step(target[None])
+        assert not state.collided.any()
+        positions.append(state.q[0])
+        torques.append(backend.report()["joint_torque"][0])
+    return np.array(positions), np.array(torques)
+
+
+def test_its_bodies_are_where_pinocchio_has_them(mara: RobotModel) -> None:
+    arm, data = DartArm(mara), mara.model.createData()
+    for q in uniform_q(mara, 50, seed=1):
+        arm.reset(q)
+        pin.forwardKinematics(mara.model, data, q)
+        for body, placement in zip(arm.bodies, data.oMi, strict=True):
+            transform = body.getWorldTransform().matrix()
+            np.testing.assert_allclose(transform, placement.homogeneous, rtol=0.0, atol=1e-9)
+
+
+def _fall(robot: RobotModel, q: Floats, step: float, seconds: float = 1.0) -> tuple[Floats, Floats]:
+    """Where a limp arm is after a while: by DART, and by Pinocchio's ABA integrated alike."""
+    arm = DartArm(robot, step, None, servo=False)
+    arm.reset(q)
+    model, data = robot.model, robot.model.createData()
+    position, velocity, none = q.copy(), np.zeros_like(q), np.zeros_like(q)
+    for _ in range(round(seconds / step)):
+        arm.world.step()
+        velocity += step * pin.aba(model, data, position, velocity, none)
+        position += step * velocity
+    return arm.q, position
+
+
+def test_it_falls_as_pinocchio_says(mara: RobotModel) -> None:
+    for q in uniform_q(mara, 20, seed=3):
+        mine, theirs = _fall(mara, q, 1e-3)
+        np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-7)
+
+
+def test_its_fall_converges_in_proportion_to_the_step(mara: RobotModel) -> None:
+    for q in uniform_q(mara, 6, seed=4):
+        exact = _fall(mara, q, 2e-5, 0.5)[1]
+        error = {step: np.abs(_fall(mara, q, step, 0.5)[0] - exact).max() for step in (1e-3, 1e-4)}
+        assert error[1e-4] < 0.2 * error[1e-3]
+        assert error[1e-3] < 0.3  # rad
+
+
+def _energies(arm: DartArm, seconds: float) -> tuple[Floats, Floats]:
+    """Kinetic and total energy of an arm that moves by itself, J."""
+    kinetic, potential = [], []
+    for _ in range(round(seconds / arm.physics_step)):
+        arm.world.step()
+        kinetic.append(arm.skeleton.computeKineticEnergy())
+        potential.append(arm.skeleton.computePotentialEnergy())
+    return np.array(kinetic), np.array(kinetic) + np.array(potential)
+
+
+def test_a_swinging_arm_keeps_its_energy(mara: RobotModel) -> None:
+    arm = DartArm(mara, 1e-3, None, servo=False)
+    arm.reset(np.array([0.3, 2.6, 0.3, 0.2, 0.3, 0.0]))  # hanging, nearly
+    kinetic, total = _energies(arm, 10.0)
+    assert np.abs(total - total[0]).max() < 0.05 * kinetic.max()
+
+
+def test_the_energy_of_a_falling_arm_drifts_in_proportion_to_the_step(mara: RobotModel) -> None:
+    drifts = []
+    for step in (1e-3, 1e-4):
+        arm = DartArm(mara, step, None, servo=False)
+        arm.reset(np.array([0.5, 1.0, 0.5, 0.3, -0.5, 0.0]))
+        kinetic, total = _energies(arm, 1.0)
+        drifts.append(np.abs(total - total[0]).max() / kinetic.max())
+    assert drifts[0] < 0.1
+    assert drifts[1] < 0.15 * drifts[0]
+
+
+@pytest.mark.parametrize("target", [FREE_TARGET, *(FREE_TARGET * np.eye(6))])
+def test_targets_are_reached_without_overshoot(mara: RobotModel, target: Floats) -> None:
+    backend = DartBackend(mara, 1)
+    positions, _ = _run(backend, target, 150)
+    assert np.abs(positions[-1] - target).max() < 1e-4
+    beyond = (positions - target) * np.sign(target)
+    assert (beyond <= 0.01 * np.abs(target) + 1e-6).all()
+
+
+def test_a_pose_is_held_against_gravity(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 1)
+    backend.reset(FREE_TARGET[None])
+    positions, torques = _run(backend, FREE_TARGET, 500)
+    assert np.abs(positions - FREE_TARGET).max() < 1e-4
+    data = mara.model.createData()
+    gravity = pin.computeGeneralizedGravity(mara.model, data, FREE_TARGET)
+    np.testing.assert_allclose(torques[-1], gravity, rtol=0.0, atol=1e-2)
+
+
+def test_motors_are_no_stronger_than_their_limits(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 1)
+    _, torques = _run(backend, FREE_TARGET, 50)
+    assert (np.abs(torques) <= mara.effort_limit * 1.01).all()
+
+
+def test_a_motor_too_weak_to_hold_the_arm_lets_it_sink(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 1, randomisation={"effort_limit": (0.1, 0.1)})
+    outstretched = np.array([0.0, 1.5, 0.0, 0.0, 0.0, 0.0])
+    backend.begin_episodes(np.zeros(1, np.uint64), np.ones(1, np.bool_))
+    backend.reset(outstretched[None])
+    for _ in range(20):
+        state = backend.step(outstretched[None])
+    assert state.q[0, 1] > 1.6
+
+
+def test_joints_are_as_fast_as_asked(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 1, max_joint_velocity=0.5)
+    speeds = np.abs([backend.step(FREE_TARGET[None]).qd[0] for _ in range(40)])
+    np.testing.assert_allclose(speeds.max(axis=0)[1:3], 0.5, atol=1e-6)
+    assert (speeds <= 0.5 + 1e-9).all()
+
+
+def test_in_free_space_it_ends_where_the_kinematic_backend_does(mara: RobotModel) -> None:
+    dynamic = DartBackend(mara, 1)
+    kinematic = make_backend("pinocchio", mara, 1, {"max_joint_velocity": 1.57})
+    apart = []
+    for _ in range(150):
+        states = [b.step(FREE_TARGET[None]) for b in (dynamic, kinematic)]
+        apart.append(np.abs(states[0].q - states[1].q).max())
+    # The servo brakes over limit / gain = 0.157 rad, where the kinematic joint stops at once.
+    assert 0.01 < max(apart) < 0.157
+    assert apart[-1] < 1e-5
+    np.testing.assert_allclose(states[0].ee_position, states[1].ee_position, atol=1e-5)
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_contacts_are_those_that_coal_finds(mara: RobotModel, detector: str) -> None:
+    arm, coal = DartArm(mara, detector=detector), make_checker("coal", mara)
+    poses = uniform_q(mara, 10_000 if detector == "fcl" else 500, seed=8)
+    found = []
+    for q in poses:
+        arm.reset(q)
+        found.append(bool(arm.contacts()))
+    differs = poses[np.array(found) != coal.check(poses)]
+    data, geometry_data = mara.model.createData(), mara.geometry.createData()
+    for q in differs:
+        pin.computeDistances(mara.model, data, mara.geometry, geometry_data, q)
+        assert abs(min(r.min_distance for r in geometry_data.distanceResults)) < 1e-3
+    assert len(differs) < 0.01 * len(poses)
+
+
+def test_contacts_name_the_links_and_their_depth(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 1)
+    backend.reset(np.array([COLLIDING_Q]))
+    (contacts,) = backend.report()["contacts"]
+    assert contacts
+    for contact in contacts:
+        assert frozenset(contact["links"]) in mara.collision_pairs
+        assert 0.0 <= contact["depth"] < 0.5
+
+
+def test_looking_only_where_contacts_can_come_about_misses_none(mara: RobotModel) -> None:
+    """Against an arm that looks for contacts at every physics step."""
+    rng = np.random.default_rng(5)
+    careful, quick = DartArm(mara), DartArm(mara)
+    careful.may_touch = lambda: True  # type: ignore[method-assign]
+    touched = 0
+    for q in uniform_q(mara, 60, seed=6):
+        careful.reset(q)
+        quick.reset(q)
+        for velocity in rng.uniform(-1.57, 1.57, (3, 6)):
+            commands = np.tile(velocity, (20, 1))
+            expected = careful.run(commands)
+            assert quick.run(commands) == expected
+            touched += bool(expected)
+    assert 20 < touched < 160
+
+
+def test_bounds_on_the_approach_of_links_hold(mara: RobotModel) -> None:
+    rng = np.random.default_rng(2)
+    data, geometry_data = mara.model.createData(), mara.geometry.createData()
+
+    def distances(q: Floats) -> Floats:
+        pin.computeDistances(mara.model, data, mara.geometry, geometry_data, q)
+        return np.array([r.min_distance for r in geometry_data.distanceResults])
+
+    for q in uniform_q(mara, 20, seed=2):
+        displacement = rng.uniform(0.0, 0.3, 6)
+        moved = q + rng.choice([-1.0, 1.0], 6) * displacement
+        nearer = distances(q) - distances(moved)
+        assert (nearer <= approach_bounds(mara, displacement) + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"physics_step": 0.003},
+        {"physics_step": 0.0},
+        {"physics_step": -0.001},
+        {"physics_step": 0.04},
+        {"servo_gain": 0.0},
+        {"max_joint_velocity": -1.0},
+        {"detector": "none"},
+        {"on_divergence": "ignore"},
+        {"randomisation": {"mass": (1.2, 0.8)}},
+        {"randomisation": {"mass": (0.0, 1.0)}},
+        {"randomisation": {"latency": (-0.01, 0.0)}},
+        {"randomisation": {"mass": 1.0}},
+        {"randomisation": {"colour": (0.0, 1.0)}},
+    ],
+    ids=str,
+)
+def test_bad_settings_are_refused(mara: RobotModel, settings: dict[str, Any]) -> None:
+    with pytest.raises(GymMaraError, match=str(next(iter(settings)))):
+        DartBackend(mara, 1, **settings)
+
+
+def _lose(backend: DartBackend, index: int) -> None:
+    """Give an arm a state that no engine can go on from."""
+    arm = backend.arms[index]
+    arm.set_state(arm.q, np.full(6, 1e200))
+
+
+def test_a_simulation_that_diverges_is_an_error(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 2)
+    _lose(backend, 1)
+    with pytest.raises(SimulationDivergedError, match="arm 1"):
+        backend.step(np.zeros((2, 6)))
+
+
+def test_a_simulation_that_diverges_can_be_cut_short(mara: RobotModel) -> None:
+    backend = DartBackend(mara, 2, on_divergence="truncate")
+    backend.step(np.full((2, 6), 0.2))
+    before = backend.state
+    _lose(backend, 1)
+    state = backend.step(np.full((2, 6), 0.2))
+    assert backend.diverged is not None
+    assert backend.diverged.tolist() == [False, True]
+    assert np.isfinite(state.q).all()
+    assert np.isfinite(state.qd).all()
+    np.testing.assert_array_equal(state.q[1], before.q[1])
+    backend.reset(np.zeros((2, 6)), backend.diverged)
+    state = backend.step(np.full((2, 6), 0.2))
+    assert backend.diverged is None
+    np.testing.assert_array_less(0.0, state.q[1])

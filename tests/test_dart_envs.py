@@ -1,0 +1,207 @@
+"""The environments on the dynamic backend: what they say of forces, contacts and random parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from gym_mara.backends.dart import DartBackend, SimulationDivergedError
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.errors import GymMaraError
+from tests.helpers import COLLIDING_Q, COPIES, ENV_IDS
+
+RANGES = {
+    "mass": (0.8, 1.2),
+    "effort_limit": (0.9, 1.0),
+    "servo_gain": (0.8, 1.2),
+    "joint_friction": (0.0, 0.5),
+    "contact_friction": (0.5, 1.0),
+    "latency": (0.0, 0.04),
+    "sensor_noise": (0.0, 1e-3),
+}
+STILL = np.zeros(6, np.float32)
+
+
+def _course(env: MaraEnv, steps: int, seed: int = 0) -> list[Any]:
+    rng = np.random.default_rng(seed)
+    return [env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32)) for _ in range(steps)]
+
+
+@pytest.mark.filterwarnings("ignore:.*has a wrapper applied")
+@pytest.mark.parametrize("name", ENV_IDS)
+@pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
+@pytest.mark.parametrize("options", [{}, {"randomisation": RANGES}], ids=["plain", "random"])
+def test_with_rescaled_actions_the_checkers_ask_for_nothing(
+    name: str, check: Callable[[gymnasium.Env[Any, Any]], None], options: dict[str, Any]
+) -> None:
+    env = gymnasium.make(name, backend="dart", disable_env_checker=True, **options)
+    rescaled = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    check(rescaled)
+    rescaled.close()
+
+
+def test_info_tells_torques_and_contacts() -> None:
+    env = MaraEnv("MARACollision-v0", backend="dart", start_q=COLLIDING_Q, on_collision="continue")
+    _, info = env.reset(seed=0)
+    assert info["contacts"]
+    _, _, _, _, info = env.step(np.array(COLLIDING_Q, np.float32))
+    assert info["collided"]
+    assert info["joint_torque"].shape == (6,)
+    assert all(contact["depth"] >= 0.0 for contact in info["contacts"])
+    assert "table" in {link for contact in info["contacts"] for link in contact["links"]}
+
+
+def test_a_collision_sends_the_arm_back_to_its_start() -> None:
+    env = MaraEnv("MARACollision-v0", backend="dart")
+    env.reset()
+    for _ in range(200):
+        observation, _, terminated, truncated, info = env.step(np.array(COLLIDING_Q, np.float32))
+        assert not terminated
+        assert not truncated
+        if info["collided"]:
+            break
+    assert info["contacts"]
+    assert np.abs(observation[:6]).max() > 1.0
+    assert np.abs(env.step(STILL)[0][:6]).max() < 1e-6
+
+
+def test_random_parameters_are_drawn_anew_for_each_episode_from_the_seed() -> None:
+    env = MaraEnv(backend="dart", randomisation=RANGES)
+    drawn = []
+    for seed in (3, None, None, 3, None):
+        _, info = env.reset(seed=seed)
+        drawn.append({name: np.array(info[name]) for name in RANGES})
+        for name, (low, high) in RANGES.items():
+            assert ((drawn[-1][name] >= low) & (drawn[-1][name] <= high)).all()
+    assert str(drawn[0]) == str(drawn[3])
+    assert str(drawn[1]) == str(drawn[4])
+    assert len({str(d) for d in drawn}) == 3
+    later = env.step(STILL)[4]
+    assert str({name: np.array(later[name]) for name in RANGES}) == str(drawn[4])
+
+
+def test_a_collision_does_not_draw_them_anew() -> None:
+    env = MaraEnv("MARACollision-v0", backend="dart", randomisation={"mass": (0.8, 1.2)})
+    _, info = env.reset(seed=0)
+    for _ in range(200):
+        _, _, _, _, now = env.step(np.array(COLLIDING_Q, np.float32))
+        if now["collided"]:
+            break
+    assert now["collided"]
+    np.testing.assert_array_equal(env.step(STILL)[4]["mass"], info["mass"])
+
+
+def test_without_ranges_nothing_is_random() -> None:
+    env = MaraEnv(backend="dart")
+    env.reset(seed=0)
+    first = str(_course(env, 5))
+    env.reset(seed=1)
+    assert str(_course(env, 5)) == first
+
+
+def test_latency_delays_the_effect_of_an_action() -> None:
+    env = MaraEnv(backend="dart", randomisation={"latency": (0.05, 0.05)})
+    env.reset(seed=0)
+    moved = [np.abs(env.step(STILL + 0.5)[0][:6]).max() for _ in range(4)]
+    assert moved[0] < 1e-6
+    assert moved[1] < 1e-6
+    np.testing.assert_allclose(moved[2], 0.010 * 1.57, rtol=0.1)  # 10 of 20 ms are left
+    np.testing.assert_allclose(moved[3], 0.030 * 1.57, rtol=0.1)
+
+
+def test_sensor_noise_is_seen_and_not_rewarded() -> None:
+    env = MaraEnv(backend="dart", randomisation={"sensor_noise": (0.01, 0.01)})
+    quiet = MaraEnv(backend="dart")
+    env.reset(seed=0)
+    quiet.reset(seed=0)
+    seen = []
+    for _ in range(200):
+        observation, reward, _, _, info = env.step(STILL)
+        _, true_reward, _, _, true_info = quiet.step(STILL)
+        assert reward == true_reward
+        assert info["distance"] == true_info["distance"]
+        seen.append(observation[:6])
+    np.testing.assert_allclose(np.std(seen, axis=0), 0.01, rtol=0.25)
+
+
+@pytest.mark.parametrize("duplicate", COPIES)
+def test_a_copy_in_mid_episode_goes_on_identically(duplicate: Callable[[MaraEnv], MaraEnv]) -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
+    env.reset(seed=0)
+    _course(env, 5)
+    other = duplicate(env)
+    assert str(_course(env, 10, seed=1)) == str(_course(other, 10, seed=1))
+    assert str(env.reset()) == str(other.reset())
+
+
+def test_it_goes_back_to_a_saved_state() -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
+    env.reset(seed=0)
+    _course(env, 5)
+    snapshot = env.save_state()
+    first = str(_course(env, 10, seed=1))
+    env.reset()
+    env.restore_state(snapshot)
+    assert str(_course(env, 10, seed=1)) == first
+
+
+def _lose(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
+    backend = env.simulation.backend
+    assert isinstance(backend, DartBackend)
+    backend.arms[arm].set_state(np.zeros(6), np.full(6, 1e200))
+
+
+def test_a_simulation_that_diverges_ends_in_an_error() -> None:
+    env = MaraEnv(backend="dart")
+    env.reset()
+    _lose(env)
+    with pytest.raises(SimulationDivergedError, match="on_divergence='truncate'"):
+        env.step(STILL)
+
+
+def test_or_truncates_the_episode_and_nothing_is_nan() -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend="dart", on_divergence="truncate")
+    env.reset()
+    env.step(STILL + 0.1)
+    _lose(env)
+    observation, reward, terminated, truncated, _ = env.step(STILL + 0.1)
+    assert np.isfinite(observation).all()
+    assert np.isfinite(reward)
+    assert (terminated, truncated) == (False, True)
+    env.reset()
+    assert not env.step(STILL + 0.1)[3]
+
+
+def test_in_a_vector_env_only_the_lost_arm_begins_anew() -> None:
+    envs = MaraVectorEnv(
+        3, backend="dart", on_divergence="truncate", autoreset_mode="SameStep", workers=1
+    )
+    envs.reset()
+    for _ in range(3):
+        envs.step(np.full((3, 6), 0.3))
+    _lose(envs, 1)
+    observation, reward, _, truncated, info = envs.step(np.full((3, 6), 0.3))
+    assert truncated.tolist() == [False, True, False]
+    assert np.isfinite(observation).all()
+    assert np.isfinite(reward).all()
+    assert np.isfinite(info["final_obs"][1]).all()
+    assert (observation[1, :6] == 0.0).all()
+    assert (observation[[0, 2], :6] > 0.05).all()
+
+
+def test_dart_that_is_not_installed_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import sys
+
+    for module in ("gym_mara.backends.dart", "gym_mara.backends.dart_arm"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "dartpy", None)
+    with pytest.raises(GymMaraError, match=r"pip install 'gym_mara\[dart\]'"):
+        MaraEnv(backend="dart")
