@@ -20,6 +20,7 @@ lint: $(READY) ## Check format, lint and types.
 
 bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some minutes.
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/dynamics.py
 
 accuracy: $(READY) ## Train three seeds of 1M steps on each environment and print their accuracy; half an hour.
 	$(BIN)/python benchmarks/accuracy.py

@@ -142,12 +142,20 @@ def transfer(
 
     folder = RunFolder.open(run)
     rows = play(folder, episodes=episodes, which=policy, options=_options(settings))
-    names = ("error, mm", "angle, deg", "return", "collisions", "settled, s", "torque", "rad/s")
-    table = Table("backend", *names, title=f"{folder.config.env}, {policy} policy")
-    for backend, *columns in rows:
-        table.add_row(backend, *(_mean_and_spread(values) for values in columns))
+    names = (
+        "position error, mm",
+        "angle, deg",
+        "return",
+        "collisions",
+        "settled after, s",
+        "highest torque / limit",
+        "highest speed, rad/s",
+    )
+    titles = [Column(row.backend.replace(", ", ",\n"), justify="right") for row in rows]
+    table = Table("", *titles, title=f"{folder.config.env}, {policy} policy")
+    for index, name in enumerate(names, start=1):
+        table.add_row(name, *(_mean_and_spread(np.asarray(row[index])) for row in rows))
     _out.print(table)
-    _out.print("torque: the highest of any joint, relative to its limit; rad/s: the highest speed")
 
 
 @app.command("list")

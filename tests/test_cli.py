@@ -45,7 +45,7 @@ def test_list_names_everything(gym_mara: Cli) -> None:
     assert "ur5" in out
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "rewards", "list"])
+@pytest.mark.parametrize("command", ["train", "evaluate", "transfer", "rewards", "list"])
 def test_help_helps(gym_mara: Cli, command: str) -> None:
     code, out, _ = gym_mara(command, "--help")
     assert code == 0
@@ -57,6 +57,9 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "4096", "--out", run)
     assert code == 0
     assert "position error, mm" in out
+    code, out, _ = gym_mara("transfer", run)
+    assert code == 0
+    assert all(word in out for word in ("dart", "pinocchio", "settled after", "highest torque"))
     code, out, _ = gym_mara("evaluate", run, "--episodes", "2", "--json", "--policy", "best")
     assert code == 0
     metrics = json.loads(out)

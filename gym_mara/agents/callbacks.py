@@ -99,6 +99,7 @@ class Keeper(BaseCallback):
         )
         if trained.norm_obs:
             env.obs_rms = trained.obs_rms
+        env.seed(self.run.config.seed)  # the same episodes each time, where they are random
         return {name: float(values.mean()) for name, values in play(self.model, env).items()}
 
 

@@ -14,7 +14,7 @@ from gym_mara.errors import unknown
 
 @dataclass(frozen=True)
 class Preset:
-    """How an algorithm trains on a task."""
+    """How an algorithm trains."""
 
     num_envs: int
     policy: str = "mlp"
@@ -25,9 +25,9 @@ class Preset:
     normalise_reward: bool = False
 
 
-# What an arm does next hangs on its action alone, hence no discounted future (γ = 0). Many arms, short rollouts, a narrow
-# start and a learning rate that falls to zero.
-_PPO_REACH = Preset(
+# Where joints are at their targets at once, what comes next hangs on the action alone, hence no discounted future (γ = 0).
+# Many arms, short rollouts, a narrow start and a learning rate that falls to zero.
+_PPO_TELEPORTING = Preset(
     num_envs=256,
     policy="natural",
     arguments={
@@ -40,20 +40,35 @@ _PPO_REACH = Preset(
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
     },
 )
+# Where they travel, an action pays off some tenths of a second later.
+_PPO_TRAVELLING = Preset(
+    num_envs=256,
+    policy="natural",
+    arguments={
+        "n_steps": 32,
+        "batch_size": 1024,
+        "n_epochs": 10,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 2e-3), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
+    },
+)
 
-# Algorithm → task → preset; a task that is not named has that of "default".
-PRESETS: dict[str, dict[str, Preset]] = {
-    "ppo": {"default": _PPO_REACH},
+# Algorithm → for joints that teleport, and for joints that travel.
+PRESETS: dict[str, tuple[Preset, Preset]] = {
+    "ppo": (_PPO_TELEPORTING, _PPO_TRAVELLING),
 }
 
 
-def preset(algorithm: str, task: str) -> Preset:
-    """The preset of an algorithm for a task.
+def preset(algorithm: str, *, teleports: bool) -> Preset:
+    """The preset of an algorithm for arms whose joints are at their targets at once, or travel there.
 
     Raises:
         GymMaraError: there is no such algorithm.
     """
     if algorithm not in PRESETS:
         raise unknown("algorithm", algorithm, PRESETS)
-    of_algorithm = PRESETS[algorithm]
-    return of_algorithm.get(task, of_algorithm["default"])
+    teleporting, travelling = PRESETS[algorithm]
+    return teleporting if teleports else travelling

@@ -43,7 +43,10 @@ def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
     for name in ("steps", "checkpoint_every"):
         if getattr(config, name) < 1:
             raise GymMaraError(f"{name} must be at least 1, not {getattr(config, name)}")
-    preset = presets.preset(config.algo, config.env)
+    algorithm_class(config.algo)  # before any backend is built
+    probe = make_env(config.env, config.backend, 1, config.env_options)
+    preset = presets.preset(config.algo, teleports=probe.env.simulation.backend.teleports)
+    probe.close()
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
     model = new_model(config)  # before the folder: what cannot be built leaves none behind
     run = RunFolder.create(out, config)

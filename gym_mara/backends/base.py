@@ -25,6 +25,8 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms go faster spread over processes: for an engine that holds Python's lock while it steps."""
+    teleports: bool = False
+    """Whether the joints are at their targets at once."""
     random: bool = False
     """Whether episodes differ; if so `begin_episodes` is called before each."""
     diverged: NDArray[np.bool_] | None = None

@@ -51,6 +51,7 @@ class PinocchioBackend(Backend):
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
         self.max_joint_velocity = None
+        self.teleports = max_joint_velocity is None
         if max_joint_velocity is not None:
             velocity = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.max_joint_velocity = velocity
