@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import resource
-import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -103,29 +102,25 @@ def print_peers() -> None:
         row(name, f"{rate:,.0f}", f"{ours / rate:.2f}")
 
 
-def _memory(count: int, queue: Any) -> None:
-    """How much memory a process with so many environments takes at most, MB."""
-    envs = [gymnasium.make(ENV_ID, backend="dart") for _ in range(count)]
-    for env in envs:
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    queue.put(peak / (2**20 if sys.platform == "darwin" else 2**10))
+def _resident() -> float:
+    """The memory that this process holds, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
 
 
 def print_memory() -> None:
     """What an environment more takes."""
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    used = []
-    for count in (1, 11):
-        process = context.Process(target=_memory, args=(count, queue))
-        process.start()
-        used.append(queue.get())
-        process.join()
-    print(
-        f"\nMemory: {used[0]:.0f} MB with one environment, {(used[1] - used[0]) / 10:.1f} MB for each more"
-    )
+    if not Path("/proc/self/statm").is_file():
+        print("\nMemory is measured on Linux only.")
+        return
+    envs, held = [], []
+    for _ in range(21):
+        env = gymnasium.make(ENV_ID, backend="dart")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        envs.append(env)
+        held.append(_resident())
+    print(f"\nMemory of each environment after the first: {(held[-1] - held[0]) / 20:.1f} MB")
 
 
 def print_energy() -> None:

@@ -90,7 +90,9 @@ class DartBackend(Backend):
         self.random = bool(self.randomisation.ranges)
         self.detector = detector
         self._kinematics = robot.kinematics()
-        self.arms = [self._new_arm() for _ in range(num_envs)]
+        self.arms: list[DartArm] = []
+        for _ in range(num_envs):
+            self.arms.append(self._new_arm())
         self._parameters = [self.randomisation.nominal() for _ in range(num_envs)]
         self._gain = np.full((num_envs, robot.num_joints), self.servo_gain)
         # The newest target last; as many as a late command may have to wait for.
@@ -105,7 +107,11 @@ class DartBackend(Backend):
 
     def _new_arm(self) -> DartArm:
         return DartArm(
-            self.robot, self.physics_step, self.detector, velocity_limit=self.joint_velocity
+            self.robot,
+            self.physics_step,
+            self.detector,
+            velocity_limit=self.joint_velocity,
+            like=self.arms[0] if self.arms else None,
         )
 
     def begin_episodes(self, seeds: NDArray[np.uint64], mask: NDArray[np.bool_]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError, MissingExtraError, unknown
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import CoalChecker, NoChecker
+from gym_mara.robot.collision import CoalChecker, CollisionChecker, NoChecker
 from gym_mara.robot.kinematics import motion_axis
 
 try:
@@ -54,6 +54,7 @@ class DartArm:
         physics_step: s.
         detector: the collision detector, one of DETECTORS; None for a world without collisions.
         velocity_limit: of the joints (J,), rad/s; None for the robot's.
+        like: another arm made alike, to share with it what has no state.
         servo: whether motors hold the joints; without them the arm falls.
 
     Raises:
@@ -67,6 +68,7 @@ class DartArm:
         detector: str | None = "fcl",
         *,
         velocity_limit: Floats | None = None,
+        like: DartArm | None = None,
         servo: bool = True,
     ) -> None:
         self.robot = robot
@@ -93,7 +95,9 @@ class DartArm:
         self._block = max(1, round(LOOK_AHEAD / physics_step))
         self._fastest = 1.05 * speed
         within_block = 1.25 * speed * self._block * physics_step
-        self._clearance = CoalChecker(robot, within_block) if detector else NoChecker(robot)
+        self._clearance: CollisionChecker = NoChecker(robot)
+        if detector is not None:
+            self._clearance = like._clearance if like else CoalChecker(robot, within_block)
 
     def _build_bodies(self) -> list[Any]:
         """A body for the base and one for each joint, in Pinocchio's order and frames."""
