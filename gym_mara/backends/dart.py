@@ -82,6 +82,7 @@ class DartBackend(Backend):
         if max_joint_velocity is not None:
             limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.joint_velocity = np.minimum(limit, robot.velocity_limit)
+        self._absurd = ABSURD * self.joint_velocity
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         if on_divergence not in ON_DIVERGENCE:
             raise unknown("on_divergence", on_divergence, ON_DIVERGENCE)
@@ -152,18 +153,18 @@ class DartBackend(Backend):
         self._torque = np.array([arm.torque for arm in self.arms])
         self._time += self.control_period
         self.diverged = None
-        sane = np.isfinite(self._q) & (np.abs(self._qd) < ABSURD * self.joint_velocity)
+        sane = np.isfinite(self._q) & (np.abs(self._qd) < self._absurd)
         if np.count_nonzero(sane) < sane.size:
             self._give_up(~sane.all(axis=1), *before)
         return self.state
 
     def _commands(self, q: Floats) -> Floats:
         """The velocities (K, N, J) that the servos command at each physics step of a period, from q (N, J)."""
-        late = self._latency // self.control_period  # whole periods by which a target is late
-        change = self._latency - late * self.control_period  # when in this period it takes effect
-        if not self._latency.any():
+        if "latency" not in self.randomisation.ranges:
             path = servo_motion(q, self._targets[-1], self._gain, self.joint_velocity, self._times)
             return (path[1:] - path[:-1]) / self.physics_step
+        late = self._latency // self.control_period  # whole periods by which a target is late
+        change = self._latency - late * self.control_period  # when in this period it takes effect
         targets = np.array(self._targets)[::-1]
         arms = np.arange(self.num_envs)
         number = late[:, 0].astype(np.int64)

@@ -208,9 +208,7 @@ class DartArm:
     @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
-        return (
-            np.array([joint.getConstraintImpulse(0) for joint in self._joints]) / self.physics_step
-        )
+        return np.asarray(self.skeleton.getConstraintForces())
 
     def run(self, velocities: Floats) -> list[Contact]:
         """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts at any of them.

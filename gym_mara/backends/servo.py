@@ -29,7 +29,8 @@ def servo_motion(
     way = q_target - q
     slow_zone = velocity_limit / gain  # within this distance the law asks for less than the limit
     distance = np.abs(way)
-    fast_time = np.maximum(distance - slow_zone, 0.0) / velocity_limit
-    fast = np.minimum(time, fast_time) * velocity_limit
-    slow = np.minimum(distance, slow_zone) * -np.expm1(-gain * np.maximum(time - fast_time, 0.0))
-    return np.copysign(fast + slow, way)
+    slow_way = np.minimum(distance, slow_zone)
+    fast_time = (distance - slow_way) / velocity_limit
+    fast = np.minimum(time, fast_time)
+    slow = slow_way * np.expm1(gain * (fast - time))
+    return np.copysign(fast * velocity_limit - slow, way)
