@@ -14,7 +14,7 @@ from gym_mara.backends.dart_arm import DETECTORS, DartArm
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import approach_bounds, make_checker
-from tests.helpers import COLLIDING_Q, Floats, uniform_q
+from tests.helpers import COLLIDING_Q, Floats, robot_model, uniform_q
 
 # In reach without touching anything on the way from home.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
@@ -165,6 +165,24 @@ def test_contacts_are_those_that_coal_finds(mara: RobotModel, detector: str) -> 
         pin.computeDistances(mara.model, data, mara.geometry, geometry_data, q)
         assert abs(min(r.min_distance for r in geometry_data.distanceResults)) < 1e-3
     assert len(differs) < 0.01 * len(poses)
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_another_robot_touches_what_coal_says(name: str) -> None:
+    robot = robot_model(name)
+    arm, coal = DartArm(robot), make_checker("coal", robot)
+    poses = uniform_q(robot, 60, seed=4)
+    flags = []
+    for q in poses:
+        arm.reset(q)
+        flags.append(bool(arm.contacts()))
+    np.testing.assert_array_equal(flags, coal.check(poses))
+
+
+def test_another_robot_falls_as_pinocchio_says() -> None:
+    robot = robot_model("ur5")  # as MARA without damping, which DART integrates implicitly
+    mine, theirs = _fall(robot, uniform_q(robot, 1, seed=4)[0], 1e-3, 0.5)
+    np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-7)
 
 
 def test_contacts_name_the_links_and_their_depth(mara: RobotModel) -> None:
