@@ -241,16 +241,22 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
         f"Interrupted. What was trained up to the last checkpoint is kept; go on with\n"
         f"gym-mara train --resume {run}"
     )
-    with _interruptible(interrupted), Progress(*columns, console=_out) as bar:
-        task = bar.add_task("", total=total)
+    bar = Progress(*columns, console=_out)
+    task = bar.add_task("", total=total)
+
+    with _interruptible(interrupted):
 
         def report(steps: int, shown: dict[str, float]) -> None:
+            bar.start()  # once the training begins: what is refused before shows no bar
             text = f"reward {shown['reward_per_step']:6.2f}" if "reward_per_step" in shown else ""
             if "eval_position_error_mm" in shown:
                 text += f"   evaluated: {shown['eval_position_error_mm']:.1f} mm"
             bar.update(task, completed=min(steps, total), description=text)
 
-        yield report
+        try:
+            yield report
+        finally:
+            bar.stop()
 
 
 @contextmanager
@@ -307,7 +313,9 @@ def _options(settings: list[str]) -> dict[str, Any]:
             raise GymMaraError(f"--set {setting!r}: write NAME=VALUE")
         try:
             options[name] = json.loads(value)
-        except ValueError:
+        except ValueError as error:
+            if value.lstrip().startswith(("{", "[", '"')):
+                raise GymMaraError(f"--set {setting}: the value is not JSON: {error}") from None
             options[name] = value
     return options
 

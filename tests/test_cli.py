@@ -52,6 +52,15 @@ def test_help_helps(gym_mara: Cli, command: str) -> None:
     assert "Usage" in out
 
 
+def test_a_setting_that_is_meant_to_be_json_must_be(gym_mara: Cli, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    code, out, error = gym_mara("train", "--set", "randomisation={'mass': (1, 2)}", "--out", run)
+    assert code != 0
+    assert "not JSON" in error
+    assert "steps" not in out, "a bar of progress"
+    assert not run.exists()
+
+
 def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     run = tmp_path / "run"
     code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "4096", "--out", run)

@@ -15,8 +15,9 @@ import json
 import os
 import platform
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from gym_mara.errors import GymMaraError, unknown
 
 POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "torch")
+_ENGINES = ("coal", "dartpy", "python-fcl")  # where they are installed
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,17 @@ class RunFolder:
         try:
             path.mkdir(parents=True)
         except FileExistsError:
+            hint = f", or go on with --resume {path}" if (path / "config.json").is_file() else ""
             raise GymMaraError(
-                f"{str(path)!r} exists and is not overwritten: choose another --out, or go on with --resume {path}"
+                f"{str(path)!r} exists and is not overwritten: choose another --out{hint}"
             ) from None
         except OSError as error:
             raise GymMaraError(f"cannot make the run folder {str(path)!r}: {error}") from error
         run = cls(path, config)
         versions = {library: version(library) for library in _LIBRARIES}
+        for library in _ENGINES:
+            with suppress(PackageNotFoundError):
+                versions[library] = version(library)
         versions["python"] = platform.python_version()
         text = json.dumps({**asdict(config), "versions": versions}, indent=2) + "\n"
         write_atomically(path / "config.json", text)

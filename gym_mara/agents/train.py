@@ -43,6 +43,8 @@ def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
     for name in ("steps", "checkpoint_every"):
         if getattr(config, name) < 1:
             raise GymMaraError(f"{name} must be at least 1, not {getattr(config, name)}")
+    if not 0 <= config.seed < 2**32:
+        raise GymMaraError(f"seed must be a whole number from 0 to 2**32 - 1, not {config.seed}")
     algorithm_class(config.algo)  # before any backend is built
     probe = make_env(config.env, config.backend, 1, config.env_options)
     preset = presets.preset(config.algo, teleports=probe.env.simulation.backend.teleports)
@@ -69,7 +71,9 @@ def resume(path: Path, report: Report) -> RunFolder:
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     model, wrapped = load_policy(checkpoints[-1], config.algo, env, training=True)
     if model.num_timesteps >= config.steps and run.has_policy("last"):
-        raise GymMaraError(f"the run {str(path)!r} has finished its {config.steps} steps")
+        raise GymMaraError(
+            f"the run {str(path)!r} has finished its {config.steps} steps; for more begin a new one"
+        )
     try:
         state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
         env.restore_state(state["env"])

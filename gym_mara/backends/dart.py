@@ -76,7 +76,8 @@ class DartBackend(Backend):
         steps = round(self.control_period / self.physics_step)
         if steps < 1 or abs(steps * self.physics_step - self.control_period) > 1e-9:
             raise GymMaraError(
-                f"physics_step {physics_step} s must divide the control period, {control_period} s"
+                f"physics_step {physics_step} s must divide the control period, {control_period} s, "
+                f"as {control_period / max(steps, 1):g} s does"
             )
         self._times = self.physics_step * np.arange(steps + 1)[:, None, None]
         if max_joint_velocity is not None:

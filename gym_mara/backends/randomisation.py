@@ -44,6 +44,11 @@ class Randomisation:
     """
 
     def __init__(self, ranges: Mapping[str, Sequence[float]], robot: RobotModel) -> None:
+        if not isinstance(ranges, Mapping):
+            raise GymMaraError(
+                f"randomisation must map names to (lowest, highest), not be {ranges!r}; "
+                f"the names: {', '.join(sorted(PARAMETERS))}"
+            )
         self.ranges = {name: _checked(name, ends) for name, ends in sorted(ranges.items())}
         self._num_joints = robot.num_joints
 

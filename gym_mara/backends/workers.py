@@ -36,7 +36,10 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
     if workers is not None:
         workers = whole_number("workers", workers)
         if num_envs % workers:
-            raise GymMaraError(f"workers={workers} must divide the number of arms, {num_envs}")
+            fitting = [str(n) for n in range(1, num_envs + 1) if num_envs % n == 0]
+            raise GymMaraError(
+                f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
+            )
         return workers
     if multiprocessing.current_process().daemon:
         return 1  # a worker itself: it may have none of its own

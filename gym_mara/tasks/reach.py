@@ -54,6 +54,9 @@ class ReachTask(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("orientation", "collision_penalty"):
+            if not isinstance(getattr(self, name), bool):
+                raise GymMaraError(f"{name} must be True or False, not {getattr(self, name)!r}")
         self._make_plain("target_position", 3)
         self._make_plain("target_quaternion", 4)
         quaternion = self.target_quaternion

@@ -153,6 +153,8 @@ def test_a_folder_that_exists_is_not_overwritten(tmp_path: Path) -> None:
         ({"steps": 0}, "steps must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
         ({"env_options": {"colour": "red"}}, "unknown keyword argument 'colour'"),
+        ({"seed": -1}, "seed must be a whole number from 0"),
+        ({"seed": 2**32}, "seed must be a whole number from 0"),
     ],
 )
 def test_a_wrong_configuration_leaves_no_folder(

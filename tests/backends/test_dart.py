@@ -242,6 +242,7 @@ def test_bounds_on_the_approach_of_links_hold(mara: RobotModel) -> None:
         {"randomisation": {"mass": (0.0, 1.0)}},
         {"randomisation": {"latency": (-0.01, 0.0)}},
         {"randomisation": {"mass": 1.0}},
+        {"randomisation": [1.0]},
         {"randomisation": {"colour": (0.0, 1.0)}},
     ],
     ids=str,
