@@ -140,9 +140,9 @@ class Simulation:
         noise = self.backend.sensor_noise
         if noise is not None:
             q = state.q.copy()
-            rows = np.arange(self.num_envs) if chosen is None else np.flatnonzero(chosen)
-            for index in rows.tolist():
-                q[index] += noise[index] * self._noise[index].standard_normal(q.shape[1])
+            for index, generator in self._noise.items():
+                if chosen is None or chosen[index]:
+                    q[index] += noise[index] * generator.standard_normal(q.shape[1])
             q = q.clip(self.robot.lower, self.robot.upper)
             position, quaternion = self._kinematics.pose(q)
             state = dataclasses.replace(state, q=q, ee_position=position, ee_quaternion=quaternion)

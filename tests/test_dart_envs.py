@@ -130,6 +130,14 @@ def test_sensor_noise_is_seen_and_not_rewarded() -> None:
     np.testing.assert_allclose(np.std(seen, axis=0), 0.01, rtol=0.25)
 
 
+def test_arms_whose_first_episode_has_not_begun_do_not_disturb_the_others() -> None:
+    envs = MaraVectorEnv(2, backend="dart", randomisation={"sensor_noise": (0.01, 0.01)}, workers=1)
+    envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
+    observation, *_ = envs.step(np.zeros((2, 6)))
+    assert (observation[0, :6] != 0.0).any()
+    assert np.abs(observation[1, :6]).max() < 1e-6
+
+
 @pytest.mark.parametrize("duplicate", COPIES)
 def test_a_copy_in_mid_episode_goes_on_identically(duplicate: Callable[[MaraEnv], MaraEnv]) -> None:
     env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)

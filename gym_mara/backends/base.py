@@ -66,7 +66,11 @@ class Backend(ABC):
 
     @abstractmethod
     def save(self) -> dict[str, Any]:
-        """A snapshot of the simulation, from which it goes on identically; it pickles."""
+        """A snapshot of the simulation, from which it goes on identically; it pickles.
+
+        Where `in_processes` is true every value is an array or a list with a row for each arm: then a snapshot fits
+        whatever number of processes the arms are spread over.
+        """
 
     @abstractmethod
     def restore(self, snapshot: dict[str, Any]) -> None:

@@ -97,9 +97,9 @@ class DartBackend(Backend):
             self.arms.append(self._new_arm())
         self._parameters = [self.randomisation.nominal() for _ in range(num_envs)]
         self._gain = np.full((num_envs, robot.num_joints), self.servo_gain)
-        # The newest target last; as many as a late command may have to wait for.
+        # (N, D, J), the newest target last; as many as a late command may have to wait for.
         longest = self.randomisation.ranges.get("latency", (0.0, 0.0))[1]
-        self._targets = [np.zeros_like(self._gain)] * (int(longest // self.control_period) + 2)
+        self._targets = np.stack([self._gain] * (int(longest // self.control_period) + 2), axis=1)
         self._latency = np.zeros((num_envs, 1))
         self._time = np.zeros(num_envs)
         # Of the arms as the engine has them, (N, J).
@@ -141,11 +141,11 @@ class DartBackend(Backend):
             self.arms[index].reset(q[index])
             self._contacts[index] = self.arms[index].contacts()
         self._q[rows], self._qd[rows], self._torque[rows] = q[rows], 0.0, 0.0
-        self._targets = [np.where(rows[:, None], q, target) for target in self._targets]
+        self._targets[rows] = q[rows, None]
         self._time[rows] = 0.0
 
     def step(self, q_target: Floats) -> SimState:
-        self._targets = [*self._targets[1:], q_target.copy()]
+        self._targets = np.concatenate([self._targets[:, 1:], q_target[:, None]], axis=1)
         commands = self._commands(self._q)
         for index, arm in enumerate(self.arms):
             self._contacts[index] = arm.run(commands[:, index])
@@ -162,14 +162,14 @@ class DartBackend(Backend):
     def _commands(self, q: Floats) -> Floats:
         """The velocities (K, N, J) that the servos command at each physics step of a period, from q (N, J)."""
         if "latency" not in self.randomisation.ranges:
-            path = servo_motion(q, self._targets[-1], self._gain, self.joint_velocity, self._times)
+            path = servo_motion(
+                q, self._targets[:, -1], self._gain, self.joint_velocity, self._times
+            )
             return (path[1:] - path[:-1]) / self.physics_step
         late = self._latency // self.control_period  # whole periods by which a target is late
         change = self._latency - late * self.control_period  # when in this period it takes effect
-        targets = np.array(self._targets)[::-1]
-        arms = np.arange(self.num_envs)
-        number = late[:, 0].astype(np.int64)
-        new, old = targets[number, arms], targets[number + 1, arms]
+        arms, newest = np.arange(self.num_envs), -1 - late[:, 0].astype(np.int64)
+        new, old = self._targets[arms, newest], self._targets[arms, newest - 1]
         limits = self._gain, self.joint_velocity
         path = servo_motion(q, old, *limits, np.minimum(self._times, change))
         then = np.maximum(self._times - change, 0.0)

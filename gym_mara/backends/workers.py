@@ -126,14 +126,17 @@ class WorkerBackend(Backend):
         return {key: np.concatenate([r[key] for r in self._reports]) for key in self._reports[0]}
 
     def save(self) -> dict[str, Any]:
-        return {"blocks": self._guarded(lambda: self._pool.call("save"))}
+        blocks = self._guarded(lambda: self._pool.call("save"))
+        return {key: _joined([block[key] for block in blocks]) for key in blocks[0]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        if len(snapshot["blocks"]) != self._pool.num_envs:
-            raise GymMaraError(
-                f"the snapshot is of {len(snapshot['blocks'])} workers; these are {self._pool.num_envs}"
-            )
-        self._tell("restore", snapshot["blocks"])
+        count = len(next(iter(snapshot.values())))
+        if count != self.num_envs:
+            raise GymMaraError(f"the snapshot is of {count} arms; these are {self.num_envs}")
+        size = count // self._pool.num_envs
+        starts = range(0, count, size)
+        blocks = [{key: v[start : start + size] for key, v in snapshot.items()} for start in starts]
+        self._tell("restore", tuple(blocks))
 
     @property
     def processes(self) -> list[Any]:
@@ -195,6 +198,13 @@ def _restored(arguments: tuple[Any, ...], snapshot: dict[str, Any]) -> WorkerBac
     backend = WorkerBackend(*arguments)
     backend.restore(snapshot)
     return backend
+
+
+def _joined(parts: list[Any]) -> Any:
+    """The rows of all blocks, of arrays or of lists."""
+    if isinstance(parts[0], list):
+        return [row for part in parts for row in part]
+    return np.concatenate(parts)
 
 
 # The fields of a state in the order in which they are packed; what diverged and the sensors' noise follow.
