@@ -53,9 +53,9 @@ def whole_number(name: str, value: Any) -> int:
     return int(value)
 
 
-def unknown(kind: str, name: object, valid: Iterable[str]) -> GymMaraError:
+def unknown(kind: str, name: object, valid: Iterable[str], where: str = "") -> GymMaraError:
     """An error for a name that is not among the valid ones, with the nearest of them."""
     names = sorted(valid)
     near = difflib.get_close_matches(str(name), names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return GymMaraError(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names)}.")
+    return GymMaraError(f"unknown {kind} {name!r}{where}.{hint} Valid: {', '.join(names)}.")

@@ -12,8 +12,8 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.backends import backend_settings, make_backend
-from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.backends import make_backend
+from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.statistics import EpisodeStatistics
@@ -67,12 +67,8 @@ class Simulation:
         self.num_envs = whole_number("num_envs", num_envs)
         self.task, settings = make_task(task, options)
         self.robot = RobotModel.load(robot, ee_frame)
-        known = backend_settings(backend)
-        for name in settings:
-            if name not in known:
-                fields = [field.name for field in dataclasses.fields(self.task)]
-                raise unknown("keyword argument", name, [*known, *fields])
-        self.backend = make_backend(backend, self.robot, self.num_envs, settings)
+        of_task = [field.name for field in dataclasses.fields(self.task)]
+        self.backend = make_backend(backend, self.robot, self.num_envs, settings, of_task)
         self.goal = self.task.goal(self.robot, self.num_envs)
         start = self.robot.home if self.task.start_q is None else self.task.start_q
         self._start = np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1))

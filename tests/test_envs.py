@@ -466,7 +466,10 @@ def test_close_closes_the_backend(
         ({"on_collision": "stop"}, r"unknown on_collision 'stop'.*continue, reset, terminate"),
         ({"collision": "bullet"}, r"unknown collision engine 'bullet'.*coal, fcl"),
         ({"colision": "fcl"}, r"unknown keyword argument 'colision'.*collision, .*control_period"),
-        ({"on_colision": "x"}, r"'on_colision'\. Did you mean 'on_collision'\?"),
+        (
+            {"on_colision": "x"},
+            r"'on_colision' with backend 'pinocchio'\. Did you mean 'on_collision'\?",
+        ),
         ({"orientation": "no"}, "orientation must be True or False, not 'no'"),
         ({"collision_penalty": 3}, "collision_penalty must be True or False, not 3"),
         ({"render_mode": "human"}, r"render_mode 'human' is not supported yet; use None"),

@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.policy import load_policy
-from gym_mara.agents.run import RunFolder
+from gym_mara.agents.run import RunConfig, RunFolder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
@@ -61,14 +61,19 @@ def evaluate_run(
     if episodes < 1:
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
     config, options = run.config, run.config.env_options
-    if backend not in (None, config.backend):  # the settings of one backend mean nothing to another
-        own = backend_settings(config.backend)
-        options = {name: value for name, value in options.items() if name not in own}
+    if backend not in (None, config.backend):
+        options = options_beyond_backend(config)
     env = make_env(config.env, backend or config.backend, episodes, options)
     try:
         return evaluate_policy_folder(run.policy(which), config.algo, env, config.seed)
     finally:
         env.close()
+
+
+def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
+    """The keyword arguments of a run's environment that mean something on any backend."""
+    own = backend_settings(config.backend)
+    return {name: value for name, value in config.env_options.items() if name not in own}
 
 
 def evaluate_policy_folder(

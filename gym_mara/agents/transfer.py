@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.agents.evaluate import MAX_EPISODE_STEPS, make_env
+from gym_mara.agents.evaluate import MAX_EPISODE_STEPS, make_env, options_beyond_backend
 from gym_mara.agents.policy import load_policy
 from gym_mara.agents.run import RunFolder
 from gym_mara.backends import backend_names, backend_settings
@@ -56,9 +56,7 @@ def transfer(
     """
     if episodes < 1:
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
-    config, given = run.config, options or {}
-    own = backend_settings(config.backend)
-    of_env = {k: v for k, v in config.env_options.items() if k not in own}
+    of_env, given = options_beyond_backend(run.config), options or {}
     settings = {name: backend_settings(name) for name in backend_names()}
     if lost := set(given).difference(*settings.values()):
         raise GymMaraError(f"no backend knows the setting {min(lost)!r}")

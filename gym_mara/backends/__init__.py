@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from typing import Any
 
 from gym_mara.backends.base import Backend
 from gym_mara.backends.workers import WorkerBackend, choose_workers
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import unknown
 from gym_mara.robot import RobotModel
 
 __all__ = ["Backend", "backend_names", "make_backend"]
@@ -59,8 +60,21 @@ def backend_settings(name: str) -> list[str]:
     return settings + ["workers"] * backend.in_processes
 
 
-def make_backend(name: str, robot: RobotModel, num_envs: int, options: dict[str, Any]) -> Backend:
+def make_backend(
+    name: str,
+    robot: RobotModel,
+    num_envs: int,
+    options: dict[str, Any],
+    others: Sequence[str] = (),
+) -> Backend:
     """A backend of this name for N arms, with settings of its own.
+
+    Args:
+        name: the backend.
+        robot: the arm.
+        num_envs: N.
+        options: the settings.
+        others: what else is a keyword argument where these come from; an error about an unknown one names them too.
 
     Raises:
         GymMaraError: the name or a setting is unknown, or a setting is out of its range.
@@ -69,9 +83,8 @@ def make_backend(name: str, robot: RobotModel, num_envs: int, options: dict[str,
     backend, settings = backend_class(name), backend_settings(name)
     for option in options:
         if option not in settings:
-            raise GymMaraError(
-                f"unknown keyword argument {option!r}: it is neither the task's nor backend "
-                f"{name!r}'s, whose settings are: {', '.join(sorted(settings))}"
+            raise unknown(
+                "keyword argument", option, [*settings, *others], f" with backend {name!r}"
             )
     if not backend.in_processes:
         return backend(robot, num_envs, **options)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
-from gym_mara.backends.dart_arm import ABSURD, Contact, DartArm
+from gym_mara.backends.dart_arm import Contact, DartArm, is_lost
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import servo_motion
 from gym_mara.errors import GymMaraError, positive_number, unknown
@@ -83,7 +83,6 @@ class DartBackend(Backend):
         if max_joint_velocity is not None:
             limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.joint_velocity = np.minimum(limit, robot.velocity_limit)
-        self._absurd = ABSURD * self.joint_velocity
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         if on_divergence not in ON_DIVERGENCE:
             raise unknown("on_divergence", on_divergence, ON_DIVERGENCE)
@@ -154,9 +153,9 @@ class DartBackend(Backend):
         self._torque = np.array([arm.torque for arm in self.arms])
         self._time += self.control_period
         self.diverged = None
-        sane = np.isfinite(self._q) & (np.abs(self._qd) < self._absurd)
-        if np.count_nonzero(sane) < sane.size:
-            self._give_up(~sane.all(axis=1), *before)
+        lost = is_lost(self._q, self._qd, self.joint_velocity)
+        if np.count_nonzero(lost):
+            self._give_up(lost, *before)
         return self.state
 
     def _commands(self, q: Floats) -> Floats:

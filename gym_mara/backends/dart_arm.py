@@ -93,7 +93,7 @@ class DartArm:
             world.getConstraintSolver().getCollisionGroup().setAutomaticUpdate(False)
         self._free_world.getConstraintSolver().getCollisionGroup().removeAllShapeFrames()
         self._block = max(1, round(LOOK_AHEAD / physics_step))
-        self._fastest = 1.05 * speed
+        self._speed, self._fastest = speed, 1.05 * speed
         within_block = 1.25 * speed * self._block * physics_step
         self._clearance: CollisionChecker = NoChecker(robot)
         if detector is not None:
@@ -245,9 +245,7 @@ class DartArm:
 
     def lost(self) -> bool:
         """Whether the arm's state has become absurd: not finite, or thrown about by numerical errors."""
-        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
-        sane = np.isfinite(q) & (np.abs(qd) < ABSURD * self._fastest)
-        return not sane.all()
+        return bool(is_lost(self.q, self.qd, self._speed))
 
     def _run_with_contacts(self, velocities: Floats, deepest: dict[tuple[str, str], float]) -> None:
         # Detectors remember where shapes have been, and report contacts in an order that hangs on it, with which the
@@ -266,6 +264,12 @@ class DartArm:
         # A step looks for contacts before it moves: those of the last one are still unseen.
         if self.world.checkCollision(self._option, found := dart.collision.CollisionResult()):
             _note(found, deepest)
+
+
+def is_lost(q: Floats, qd: Floats, velocity_limit: Floats) -> NDArray[np.bool_]:
+    """Which arms' states, q and q̇ (..., J), are absurd: not finite, or beyond all limits of velocity (J,)."""
+    sane = np.isfinite(q) & (np.abs(qd) < ABSURD * velocity_limit)
+    return np.logical_not(np.logical_and.reduce(sane, axis=-1))
 
 
 def _world(physics_step: float, detector: str) -> Any:
