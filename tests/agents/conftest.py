@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gym_mara.agents.run import RunConfig, RunFolder
-from gym_mara.agents.train import train
+from gym_mara.agents.train import train, use_one_thread
 
 ROLLOUT = 256 * 8
 """Steps between two updates of the preset."""
@@ -28,6 +28,12 @@ def config(**changes: object) -> RunConfig:
 
 def silent(steps: int, shown: dict[str, float]) -> None:
     """No progress is reported."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    """Tests run in several processes, which share the cores."""
+    use_one_thread()
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,192 @@
+"""K-FAC: natural-gradient steps from a Kronecker-factored Fisher matrix, each within a trust region.
+
+For a linear layer y = W̄ā with ā = [a, 1] and g = -∂ log p / ∂y, the layer's block of the Fisher matrix is taken as
+G ⊗ A, A = E[ā āᵀ] and G = E[g gᵀ], the expectations over what the model itself predicts (Martens and Grosse 2015,
+"Optimizing neural networks with Kronecker-factored approximate curvature"). Two small matrices are inverted, and not one
+that is as wide as the layer has weights.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gym_mara.errors import GymMaraError
+
+# How often a step is shortened until the model has moved no further than the trust region.
+_ATTEMPTS = 10
+_LEAST_DAMPING = 1e-5
+
+
+class KFAC(torch.optim.Optimizer):
+    """Natural-gradient descent for a network of linear layers (Wu et al. 2017, "ACKTR").
+
+    An update: inside `watch()` run the model; give `observe` the loss of outputs that the model itself has drawn; put the
+    gradients into place with `backward()`; then `step`.
+
+    Args:
+        layers: the network's linear layers.
+        exact: other parameters, each with the diagonal of its Fisher matrix, where that is known and constant.
+        lr: the learning rate η: a step is -η F⁻¹∇L, where that is within the trust region.
+        trust_region: how far a step may move the model's predictions, as a KL divergence.
+        damping: λ, split over the two factors: A + π√λ 1 and G + √λ/π 1, with π² the ratio of their mean eigenvalues
+            (factored Tikhonov; Martens and Grosse 2015, section 6.3).
+        decay: of the factors' running averages.
+        momentum: of the natural gradients' running average.
+        cold_updates: so many first updates are plain gradient descent, until the factors are worth inverting.
+        max_grad_norm: of the gradients in those.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[nn.Linear],
+        exact: Sequence[tuple[nn.Parameter, float]] = (),
+        *,
+        lr: float = 0.25,
+        trust_region: float = 1e-3,
+        damping: float = 1e-2,
+        decay: float = 0.99,
+        momentum: float = 0.9,
+        cold_updates: int = 10,
+        max_grad_norm: float = 0.5,
+    ) -> None:
+        groups: list[dict[str, Any]] = [{"params": list(layer.parameters())} for layer in layers]
+        groups += [{"params": [parameter], "fisher": fisher} for parameter, fisher in exact]
+        super().__init__(groups, {"lr": lr, "updates": 0})
+        self.trust_region = trust_region
+        self.damping = damping
+        self.decay = decay
+        self.momentum = momentum
+        self.cold_updates = cold_updates
+        self.max_grad_norm = max_grad_norm
+        self._layers = list(layers)
+        self._seen: dict[nn.Module, tuple[Tensor, Tensor]] = {}
+
+    @contextmanager
+    def watch(self) -> Iterator[None]:
+        """Note what goes into the layers and comes out of them."""
+
+        def note(layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+            self._seen[layer] = inputs[0].detach(), output
+
+        hooks = [layer.register_forward_hook(note) for layer in self._layers]
+        try:
+            yield
+        finally:
+            for hook in hooks:
+                hook.remove()
+
+    def observe(self, loss: Tensor) -> None:
+        """Take up the Fisher factors of the model as watched.
+
+        Args:
+            loss: -log p of an output that the model has drawn, for each example (N,).
+        """
+        outputs = [self._seen[layer][1] for layer in self._layers]
+        gradients = torch.autograd.grad(loss.sum(), outputs, retain_graph=True)
+        for layer, group, g in zip(self._layers, self.param_groups, gradients, strict=False):
+            a = self._seen[layer][0]
+            if layer.bias is not None:
+                a = torch.cat([a, a.new_ones(len(a), 1)], dim=1)
+            state = self.state[layer.weight]
+            # A plain mean at first, so that the first examples do not count for more than the later ones.
+            weight = max(1.0 - self.decay, 1.0 / (group["updates"] + 1))
+            for name, rows in (("A", a), ("G", g)):
+                factor = rows.T @ rows / len(rows)
+                state[name] = torch.lerp(state[name], factor, weight) if name in state else factor
+        self._seen.clear()
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float:  # type: ignore[override]
+        """Change the parameters by their gradients, as far as the trust region allows.
+
+        Args:
+            closure: how far the model now stands from where it stood before the step, as a KL divergence; without it the
+                Kronecker factors' own estimate is relied on.
+
+        Returns:
+            How far the model has moved, as a KL divergence.
+
+        Raises:
+            GymMaraError: a gradient is not finite; nothing has changed then.
+        """
+        gradients = [self._gradient(group) for group in self.param_groups]
+        if not all(gradient.isfinite().all() for gradient in gradients):
+            raise GymMaraError(
+                "the gradient is not finite: look for rewards or observations that are not, or learn more slowly"
+            )
+        if self.param_groups[0]["updates"] < self.cold_updates:
+            norm = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
+            shrink = min(1.0, self.max_grad_norm / (norm + 1e-8))
+            directions = [shrink * gradient for gradient in gradients]
+        else:
+            pairs = zip(self.param_groups, gradients, strict=True)
+            directions = [self.natural_gradient(group, gradient) for group, gradient in pairs]
+        steps = []
+        for group, direction in zip(self.param_groups, directions, strict=True):
+            state = self.state[group["params"][0]]
+            velocity = state.get("velocity", torch.zeros_like(direction))
+            state["velocity"] = torch.lerp(direction, velocity, self.momentum)
+            steps.append(-group["lr"] * state["velocity"])
+            group["updates"] += 1
+        return self._move(steps, closure)
+
+    def _gradient(self, group: dict[str, Any]) -> Tensor:
+        """A layer's gradient as a matrix, the bias its last column; or that of another parameter as it is."""
+        gradients = [parameter.grad for parameter in group["params"]]
+        if len(gradients) == 1:
+            return gradients[0]
+        return torch.cat([gradients[0], gradients[1][:, None]], dim=1)
+
+    def natural_gradient(self, group: dict[str, Any], gradient: Tensor) -> Tensor:
+        """F⁻¹∇L of one group of parameters, with the damped Fisher matrix F."""
+        if "fisher" in group:
+            return gradient / (group["fisher"] + self.damping)
+        state = self.state[group["params"][0]]
+        a, g = state["A"].double(), state["G"].double()
+        mean_a, mean_g = float(a.diagonal().mean()), float(g.diagonal().mean())
+        # Of each factor's mean eigenvalue; rounding leaves the factors' smallest ones unknown to some 1e-6 of it.
+        relative = max(math.sqrt(self.damping / max(mean_a * mean_g, 1e-30)), _LEAST_DAMPING)
+        a.diagonal().add_(relative * mean_a)
+        g.diagonal().add_(relative * mean_g)
+        left = torch.cholesky_solve(gradient.double(), torch.linalg.cholesky(g))
+        return torch.cholesky_solve(left.T, torch.linalg.cholesky(a)).T.to(gradient.dtype)
+
+    def divergence(self, steps: list[Tensor]) -> float:
+        """The Fisher matrix's estimate, ½ ΔᵀFΔ, of how far steps Δ, one a group, move the model."""
+        total = 0.0
+        for group, step in zip(self.param_groups, steps, strict=True):
+            if "fisher" in group:
+                total += float(group["fisher"] * step.square().sum())
+            else:
+                state = self.state[group["params"][0]]
+                total += float(((state["G"] @ step @ state["A"]) * step).sum())
+        return max(0.5 * total, 0.0)  # rounding can bring it below
+
+    def _move(self, steps: list[Tensor], closure: Callable[[], float] | None) -> float:
+        """Make the steps, shortened as often as it takes."""
+        origin = [[p.clone() for p in group["params"]] for group in self.param_groups]
+        expected = self.divergence(steps)
+        scale = math.sqrt(self.trust_region / max(expected, self.trust_region))
+        for _ in range(_ATTEMPTS):
+            self._place(origin, steps, scale)
+            if closure is None:
+                return scale**2 * expected
+            moved = closure()
+            if moved <= self.trust_region:
+                return moved
+            # The divergence grows with the square of a small step.
+            scale *= 0.95 * math.sqrt(self.trust_region / moved) if math.isfinite(moved) else 0.1
+        self._place(origin, steps, 0.0)
+        return 0.0
+
+    def _place(self, origin: list[list[Tensor]], steps: list[Tensor], scale: float) -> None:
+        for group, old, step in zip(self.param_groups, origin, steps, strict=True):
+            parts = [step] if len(old) == 1 else [step[:, :-1], step[:, -1]]
+            for parameter, start, part in zip(group["params"], old, parts, strict=True):
+                parameter.copy_(start + scale * part)

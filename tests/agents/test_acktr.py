@@ -1,0 +1,145 @@
+"""ACKTR as an algorithm of Stable-Baselines3: it learns, stays in its trust region, and goes through a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecNormalize
+
+import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.agents.acktr import ACKTR
+from gym_mara.agents.evaluate import make_env
+from gym_mara.errors import GymMaraError
+
+
+class Watcher(BaseCallback):
+    """Notes what each update logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[dict[str, float]] = []
+
+    def _on_rollout_start(self) -> None:
+        self.seen.append(dict(self.logger.name_to_value))
+
+    def _on_step(self) -> bool:
+        return True
+
+    def of(self, name: str) -> list[float]:
+        return [values[name] for values in self.seen if name in values]
+
+
+def test_it_learns_a_task_with_discrete_actions() -> None:
+    env = make_vec_env("CartPole-v1", n_envs=8, seed=0)
+    model = ACKTR("MlpPolicy", env, n_steps=32, seed=0, device="cpu")
+    model.learn(40_000)
+    rewards, _ = evaluate_policy(model, env, n_eval_episodes=10, return_episode_rewards=True)
+    assert np.mean(rewards) > 100.0, "untrained it is some 20"
+
+
+def test_it_learns_to_reach() -> None:
+    env = make_env("MARA-v0", "pinocchio", 64, {})
+    model = ACKTR(
+        "MlpPolicy",
+        env,
+        n_steps=4,
+        gamma=0.0,
+        target_kl=1e-2,
+        policy_kwargs={"log_std_init": -1.5},
+        seed=0,
+        device="cpu",
+    )
+    watcher = Watcher()
+    model.learn(50_000, callback=watcher)
+    assert np.mean(watcher.of("train/policy_loss")) < 0.0
+    observation: Any = env.reset()
+    for _ in range(5):
+        action, _ = model.predict(observation, deterministic=True)
+        observation, reward, _, _ = env.step(action)
+    assert reward.min() > -0.4, "at the start it is -0.99"
+
+
+@pytest.mark.parametrize("learning_rate", [0.25, 100.0])
+def test_an_update_moves_the_policy_no_further_than_the_trust_region(learning_rate: float) -> None:
+    env = make_env("MARAOrient-v0", "pinocchio", 16, {})
+    model = ACKTR("MlpPolicy", env, learning_rate, n_steps=8, target_kl=2e-3, seed=0, device="cpu")
+    watcher = Watcher()
+    model.learn(16 * 8 * 40, callback=watcher)
+    moved = watcher.of("train/kl")
+    assert len(moved) == 39
+    assert max(moved) <= 2e-3
+    assert np.median(moved) > 1e-4, "it uses what it is allowed"
+    assert max(watcher.of("train/critic_kl")) <= model.critic_kl
+
+
+def test_the_first_updates_are_cold() -> None:
+    model = ACKTR("MlpPolicy", "Pendulum-v1", n_steps=16, cold_updates=3, seed=0, device="cpu")
+    calls = []
+    natural = model.actor_optimizer.natural_gradient
+
+    def count(group: dict[str, Any], gradient: torch.Tensor) -> torch.Tensor:
+        calls.append(model._n_updates)
+        return natural(group, gradient)
+
+    model.actor_optimizer.natural_gradient = count  # type: ignore[method-assign]
+    model.learn(16 * 5)
+    assert set(calls) == {3, 4}
+
+
+def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, seed=0))
+    model = ACKTR("MlpPolicy", env, n_steps=16, seed=0, device="cpu")
+    model.learn(16 * 2 * 15)
+    model.save(tmp_path / "model")
+    loaded = ACKTR.load(tmp_path / "model", env=env, device="cpu")
+    observation = env.observation_space.sample()[None]
+    mine, theirs = (m.predict(observation, deterministic=True)[0] for m in (model, loaded))
+    np.testing.assert_array_equal(mine, theirs)
+    assert loaded.target_kl == model.target_kl
+    for before, after in zip(_state(model), _state(loaded), strict=True):
+        assert torch.equal(before, after)
+    loaded.learn(64, reset_num_timesteps=False)
+
+
+def _state(model: ACKTR) -> list[torch.Tensor]:
+    optimizers = model.actor_optimizer, model.critic_optimizer
+    return [
+        value
+        for optimizer in optimizers
+        for state in optimizer.state_dict()["state"].values()
+        for value in state.values()
+    ]
+
+
+def test_it_logs_to_tensorboard(tmp_path: Path) -> None:
+    model = ACKTR("MlpPolicy", "CartPole-v1", tensorboard_log=str(tmp_path), device="cpu")
+    model.learn(200)
+    assert list(tmp_path.glob("*/events*"))
+
+
+def test_a_policy_of_other_layers_is_refused() -> None:
+    class OddPolicy(ActorCriticPolicy):
+        def _build_mlp_extractor(self) -> None:
+            super()._build_mlp_extractor()
+            self.mlp_extractor.policy_net.append(torch.nn.LayerNorm(64))
+
+    with pytest.raises(GymMaraError, match=r"linear layers.*policy_net"):
+        ACKTR(OddPolicy, "CartPole-v1", device="cpu")
+
+
+def test_an_action_space_it_does_not_know_is_refused() -> None:
+    class Odd(gymnasium.Env[np.ndarray, np.ndarray]):  # type: ignore[type-arg]
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+        action_space = gymnasium.spaces.MultiBinary(2)  # type: ignore[assignment]
+
+    with pytest.raises(AssertionError, match="only supports"):
+        ACKTR("MlpPolicy", Odd(), device="cpu")  # type: ignore[arg-type]
