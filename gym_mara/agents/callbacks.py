@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import random
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -29,13 +30,15 @@ class Keeper(BaseCallback):
     Args:
         run: where to write.
         best: the best evaluation so far, as reward per step.
+        elapsed: how long the run has trained before, s.
         report: called after every update with the number of steps and what to show.
     """
 
-    def __init__(self, run: RunFolder, best: float, report: Report) -> None:
+    def __init__(self, run: RunFolder, best: float, elapsed: float, report: Report) -> None:
         super().__init__()
         self.run = run
         self.best = best
+        self._began = time.monotonic() - elapsed
         self.report = report
         self.shown: dict[str, float] = {}
         self._next = 0
@@ -55,7 +58,8 @@ class Keeper(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        env = base_env(self.model)
+        model = self.model
+        env = base_env(model)
         steps = self.model.n_steps * env.num_envs  # type: ignore[attr-defined]
         self.shown["reward_per_step"] = env.reward_sum / steps
         env.reward_sum = 0.0
@@ -74,13 +78,16 @@ class Keeper(BaseCallback):
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[f"eval_{name}"] = value
+        elapsed = time.monotonic() - self._began
         self.logger.record("time/total_timesteps", steps)
+        self.logger.record("time/time_elapsed", round(elapsed, 1))
         self.logger.dump(steps)
         if self.shown["eval_reward_per_step"] > self.best:
             self.best = self.shown["eval_reward_per_step"]
             save_policy(self.run.path / "best", model)
         state = {
             "best": self.best,
+            "elapsed": elapsed,
             "env": base_env(model).save_state(),
             "returns": normalisation(model).returns,
             "random": random_state(),

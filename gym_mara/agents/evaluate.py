@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.policy import load_policy
@@ -65,7 +64,9 @@ def evaluate_run(
         options = options_beyond_backend(config)
     env = make_env(config.env, backend or config.backend, episodes, options)
     try:
-        return evaluate_policy_folder(run.policy(which), config.algo, env, config.seed)
+        policy, wrapped = load_policy(run.policy(which), config, env)
+        env.seed(config.seed)
+        return play(policy, wrapped)
     finally:
         env.close()
 
@@ -76,21 +77,12 @@ def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in config.env_options.items() if name not in own}
 
 
-def evaluate_policy_folder(
-    folder: Path, algo: str, env: MaraVecEnv, seed: int
-) -> dict[str, NDArray[np.float64]]:
-    """Play one episode per arm of `env` with the policy in a folder."""
-    model, wrapped = load_policy(folder, algo, env, training=False)
-    env.seed(seed)
-    return play(model, wrapped)
-
-
-def play(model: BaseAlgorithm, env: VecNormalize) -> dict[str, NDArray[np.float64]]:
+def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, NDArray[np.float64]]:
     """Play one episode per arm with the deterministic policy; METRICS, each (N,)."""
     results: list[dict[str, Any] | None] = [None] * env.num_envs
     observation: Any = env.reset()
     while any(result is None for result in results):
-        action, _ = model.predict(observation, deterministic=True)
+        action, _ = policy.predict(observation, deterministic=True)
         observation, _, done, infos = env.step(action)
         for index in np.flatnonzero(done):
             results[index] = results[index] or infos[index]

@@ -18,11 +18,10 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
+from torch.distributions import MultivariateNormal
 
 # Standard deviations stay above this: much below it actions, which are float32 of order 1, no longer tell them apart.
-LEAST_STD = 1e-5
-# How fast the covariance is learnt, relative to the mean.
-COVARIANCE_RATE = 0.5
+LEAST_STD = 1e-6
 
 
 class NaturalGaussian(Distribution):
@@ -40,7 +39,7 @@ class NaturalGaussian(Distribution):
     def proba_distribution(
         self, mean: Tensor, log_scale: Tensor, centre: Tensor, factor: Tensor
     ) -> NaturalGaussian:
-        self.mean, self.centre = mean, centre
+        self.mean, self.log_scale, self.centre, self.factor = mean, log_scale, centre, factor
         self.scale = factor @ torch.matrix_exp(log_scale)
         self.inverse_scale = torch.matrix_exp(-log_scale) @ torch.linalg.inv(factor)
         self.log_volume = torch.linalg.slogdet(factor).logabsdet + log_scale.trace()
@@ -50,6 +49,15 @@ class NaturalGaussian(Distribution):
         noise = (actions - self.centre) @ self.inverse_scale.T - self.mean
         constant = 0.5 * noise.shape[1] * math.log(2.0 * math.pi)
         return -0.5 * noise.square().sum(dim=1) - self.log_volume - constant
+
+    @property
+    def distribution(self) -> MultivariateNormal:  # type: ignore[override]
+        """The same as torch has it, of F⁻¹(a - c): divergences from others with this c and F are alike in both."""
+        return MultivariateNormal(
+            self.mean @ torch.matrix_exp(self.log_scale).T,
+            torch.matrix_exp(2.0 * self.log_scale),
+            validate_args=False,
+        )
 
     def entropy(self) -> Tensor:
         count, size = self.mean.shape
@@ -70,16 +78,29 @@ class NaturalGaussian(Distribution):
 
 
 class NaturalGaussianPolicy(ActorCriticPolicy):
-    """Stable-Baselines3's actor and critic with a NaturalGaussian, for box actions; its arguments are the same.
+    """Stable-Baselines3's actor and critic with a NaturalGaussian, for box actions.
 
     Before each update the centre moves to the mean of the rollout's actions and the factor takes up what was learnt of
     the covariance; neither changes the policy.
+
+    Args:
+        *args, **kwargs: as of ActorCriticPolicy.
+        covariance_rate: how fast the covariance is learnt, relative to the mean.
     """
 
     centre: Tensor
     factor: Tensor
     action_net: nn.Linear
     action_dist: NaturalGaussian
+
+    def __init__(self, *args: Any, covariance_rate: float = 1.0, **kwargs: Any) -> None:
+        self.covariance_rate = covariance_rate
+        super().__init__(*args, **kwargs)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return super()._get_constructor_parameters() | {
+            "covariance_rate": self.covariance_rate,
+        }
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
@@ -102,7 +123,7 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         )
 
     def _symmetric_log_scale(self) -> Tensor:
-        return 0.5 * COVARIANCE_RATE * (self.log_scale + self.log_scale.T)
+        return 0.5 * self.covariance_rate * (self.log_scale + self.log_scale.T)
 
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Act in a rollout: actions, values and log-probabilities."""

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+import io
+import json
 import pickle
 import shutil
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gym_mara.agents.acktr import ACKTR
 from gym_mara.agents.natural_gaussian import NaturalGaussianPolicy
-from gym_mara.agents.run import replace_folder
+from gym_mara.agents.presets import Preset
+from gym_mara.agents.run import DamagedRunError, RunConfig, replace_folder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.errors import GymMaraError, unknown
 
 # What reading a pickle or a zip that was cut short or overwritten raises.
 DAMAGE = (OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, pickle.UnpicklingError)
 
-ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO}
+ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO, "trpo": TRPO, "acktr": ACKTR}
 POLICY_CLASSES: dict[str, type[ActorCriticPolicy]] = {
     "mlp": ActorCriticPolicy,
     "natural": NaturalGaussianPolicy,
@@ -47,49 +56,100 @@ def save_policy(
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     model.save(temporary / "model.zip")
-    normalisation(model).save(str(temporary / "normalisation.pkl"))
+    text = json.dumps(_normalisation_values(normalisation(model)), indent=2) + "\n"
+    (temporary / "normalisation.json").write_text(text)
     for name, content in (extra or {}).items():
         (temporary / name).write_bytes(content)
     replace_folder(temporary, folder)
 
 
 def load_policy(
-    folder: Path, algo: str, env: MaraVecEnv, *, training: bool
-) -> tuple[OnPolicyAlgorithm, VecNormalize]:
-    """Read a policy's folder and join it to an environment.
+    folder: Path, config: RunConfig, env: MaraVecEnv
+) -> tuple[ActorCriticPolicy, VecNormalize]:
+    """The policy in a folder, to act on an environment, which may be one whose joints are faster or slower.
+
+    Only numbers are read; nothing is unpickled that could run code.
 
     Raises:
-        GymMaraError: a file is missing or damaged, or the policy is one of another environment.
+        DamagedRunError: a file is missing or damaged.
+        GymMaraError: the policy is one of another environment.
     """
+    preset = Preset(**config.preset)
+    arguments = preset.arguments.get("policy_kwargs", {})
+    make = POLICY_CLASSES[preset.policy]
+    policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
+    with _told(folder):
+        with zipfile.ZipFile(folder / "model.zip") as archive, archive.open("policy.pth") as file:
+            weights = torch.load(io.BytesIO(file.read()), map_location="cpu", weights_only=True)
+        policy.load_state_dict(weights)
+        wrapped = _normalised(folder, env, training=False)
+    policy.set_training_mode(False)
+    return policy, wrapped
+
+
+def load_model(folder: Path, algo: str, env: MaraVecEnv) -> tuple[OnPolicyAlgorithm, VecNormalize]:
+    """The algorithm in a folder, to go on training; reading it unpickles, and a pickle can run any code.
+
+    Raises:
+        DamagedRunError: a file is missing or damaged.
+        GymMaraError: the policy is one of another environment.
+    """
+    with _told(folder):
+        wrapped = _normalised(folder, env, training=True)
+        file = folder / "model.zip"
+        model = algorithm_class(algo).load(file, env=wrapped, device="cpu", force_reset=False)
+    return model, wrapped
+
+
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    """Tell in a line what is wrong with a policy's folder."""
     try:
-        wrapped = VecNormalize.load(str(folder / "normalisation.pkl"), env)
-        wrapped.training = training
-        # To act it needs no environment, and may come from one whose joints are faster or slower.
-        model = algorithm_class(algo).load(
-            folder / "model.zip",
-            env=wrapped if training else None,
-            device="cpu",
-            force_reset=False,
-        )
-        for mine, theirs in (
-            (model.observation_space, env.observation_space),
-            (model.action_space, env.action_space),
-        ):
-            if mine.shape != theirs.shape:
-                raise ValueError(f"the policy's space is {mine}, the environment's {theirs}")
-    except GymMaraError:
-        raise
+        if not zipfile.is_zipfile(folder / "model.zip"):
+            raise zipfile.BadZipFile("model.zip is missing or no zip file")
+        yield
     except DAMAGE as error:
-        raise GymMaraError(f"the policy in {str(folder)!r} is damaged: {error}") from error
-    except (ValueError, AssertionError) as error:
+        raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
+    except (ValueError, AssertionError, RuntimeError) as error:
         raise GymMaraError(
             f"the policy in {str(folder)!r} does not fit the environment: {error}"
         ) from error
-    return model, wrapped
 
 
 def normalisation(model: OnPolicyAlgorithm) -> VecNormalize:
     """The normalisation that every agent here is wrapped in, whether it normalises or only counts."""
     wrapped: Any = model.get_vec_normalize_env()
     assert isinstance(wrapped, VecNormalize)
+    return wrapped
+
+
+_STATISTICS = {"observation": "obs_rms", "return": "ret_rms"}
+
+
+def _normalisation_values(wrapped: VecNormalize) -> dict[str, Any]:
+    """A normalisation as plain values."""
+    values: dict[str, Any] = {
+        name: getattr(wrapped, name) for name in ("norm_obs", "norm_reward", "gamma")
+    }
+    for name, attribute in _STATISTICS.items():
+        running = vars(wrapped).get(attribute)  # there only if it is used
+        if running is None:
+            continue
+        mean, variance = np.asarray(running.mean).tolist(), np.asarray(running.var).tolist()
+        values[name] = {"mean": mean, "var": variance, "count": float(running.count)}
+    return values
+
+
+def _normalised(folder: Path, env: MaraVecEnv, *, training: bool) -> VecNormalize:
+    """The environment in the normalisation of a folder."""
+    try:
+        values = json.loads((folder / "normalisation.json").read_text())
+        read = {name: values.pop(name) for name in _STATISTICS if name in values}
+        wrapped = VecNormalize(env, training=training, **values)
+        for name, numbers in read.items():
+            running = getattr(wrapped, _STATISTICS[name])
+            running.mean, running.var = np.array(numbers["mean"]), np.array(numbers["var"])
+            running.count = numbers["count"]
+    except (TypeError, json.JSONDecodeError) as error:
+        raise KeyError(f"normalisation.json: {error}") from error
     return wrapped

@@ -24,8 +24,12 @@ from typing import Any
 from gym_mara.errors import GymMaraError, unknown
 
 POLICIES = ("last", "best")
-_LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "torch")
+_LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "sb3_contrib", "torch")
 _ENGINES = ("coal", "dartpy", "python-fcl")  # where they are installed
+
+
+class DamagedRunError(GymMaraError):
+    """What a run has left cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class RunConfig:
     """How many steps lie between two checkpoints; each is evaluated."""
     env_options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment besides `backend`."""
+    preset_name: str = "tuned"
     preset: dict[str, Any] = field(default_factory=dict)
     """The preset as it was, so that a later change of it does not change the run."""
 
@@ -87,13 +92,13 @@ class RunFolder:
         """
         file = path / "config.json"
         if not file.is_file():
-            raise GymMaraError(f"{str(path)!r} is no run folder: it has no config.json")
+            raise DamagedRunError(f"{str(path)!r} is no run folder: it has no config.json")
         try:
             values = json.loads(file.read_text())
             values.pop("versions")
             return cls(path, RunConfig(**values))
         except (ValueError, KeyError, TypeError) as error:
-            raise GymMaraError(
+            raise DamagedRunError(
                 f"the run folder {str(path)!r} is damaged: cannot read config.json ({error})"
             ) from error
 
@@ -101,6 +106,11 @@ class RunFolder:
     def progress_file(self) -> Path:
         """The table of progress, a row per update."""
         return self.path / "progress.csv"
+
+    def seconds(self) -> float:
+        """How long the run has trained, up to its last checkpoint, s."""
+        column = "time/time_elapsed"
+        return max((r[column] for r in read_progress(self.progress_file) if column in r), default=0)
 
     def checkpoints(self) -> list[Path]:
         """The folders of the complete checkpoints, the oldest first."""

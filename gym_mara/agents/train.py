@@ -29,13 +29,21 @@ from gym_mara.agents.callbacks import (
 )
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import DAMAGE, POLICY_CLASSES, algorithm_class, load_policy
-from gym_mara.agents.run import RunConfig, RunFolder, read_progress
+from gym_mara.agents.policy import DAMAGE, POLICY_CLASSES, algorithm_class, load_model
+from gym_mara.agents.run import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError
 
 
-def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
+def train(
+    config: RunConfig, out: Path, report: Report, *, preset: presets.Preset | None = None
+) -> RunFolder:
     """Train an agent into a new run folder.
+
+    Args:
+        config: what to train.
+        out: the folder.
+        report: called after every update.
+        preset: hyperparameters in place of the preset that the configuration names.
 
     Raises:
         GymMaraError: a name is unknown, a value out of range, or the folder exists.
@@ -46,13 +54,15 @@ def train(config: RunConfig, out: Path, report: Report) -> RunFolder:
     if not 0 <= config.seed < 2**32:
         raise GymMaraError(f"seed must be a whole number from 0 to 2**32 - 1, not {config.seed}")
     algorithm_class(config.algo)  # before any backend is built
-    probe = make_env(config.env, config.backend, 1, config.env_options)
-    preset = presets.preset(config.algo, teleports=probe.env.simulation.backend.teleports)
-    probe.close()
+    if preset is None:
+        probe = make_env(config.env, config.backend, 1, config.env_options)
+        teleports = probe.env.simulation.backend.teleports
+        preset = presets.preset(config.algo, config.preset_name, teleports=teleports)
+        probe.close()
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
     model = new_model(config)  # before the folder: what cannot be built leaves none behind
     run = RunFolder.create(out, config)
-    return _learn(run, model, best=-np.inf, report=report)
+    return _learn(run, model, report=report)
 
 
 def resume(path: Path, report: Report) -> RunFolder:
@@ -65,11 +75,11 @@ def resume(path: Path, report: Report) -> RunFolder:
     config = run.config
     checkpoints = run.checkpoints()
     if not checkpoints:
-        return _learn(run, new_model(config), best=-np.inf, report=report)
+        return _learn(run, new_model(config), report=report)
     use_one_thread()
     preset = presets.Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
-    model, wrapped = load_policy(checkpoints[-1], config.algo, env, training=True)
+    model, wrapped = load_model(checkpoints[-1], config.algo, env)
     if model.num_timesteps >= config.steps and run.has_policy("last"):
         raise GymMaraError(
             f"the run {str(path)!r} has finished its {config.steps} steps; for more begin a new one"
@@ -80,10 +90,10 @@ def resume(path: Path, report: Report) -> RunFolder:
         wrapped.returns = state["returns"]
         restore_random_state(state["random"])
     except DAMAGE as error:
-        raise GymMaraError(
+        raise DamagedRunError(
             f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
         ) from error
-    return _learn(run, model, best=state["best"], report=report)
+    return _learn(run, model, report=report, best=state["best"], elapsed=state["elapsed"])
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
@@ -126,13 +136,20 @@ def _schedule(value: Any) -> Any:
     return PiecewiseLinear(value) if is_points else value
 
 
-def _learn(run: RunFolder, model: OnPolicyAlgorithm, *, best: float, report: Report) -> RunFolder:
+def _learn(
+    run: RunFolder,
+    model: OnPolicyAlgorithm,
+    *,
+    report: Report,
+    best: float = -np.inf,
+    elapsed: float = 0.0,
+) -> RunFolder:
     model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
     report(model.num_timesteps, {})
     try:
         model.learn(
             run.config.steps - model.num_timesteps,
-            callback=Keeper(run, best, report),
+            callback=Keeper(run, best, elapsed, report),
             reset_num_timesteps=False,
         )
     finally:  # an interrupt among the ways out

@@ -78,13 +78,13 @@ def _play(
 ) -> Transferred:
     env = make_env(run.config.env, backend, episodes, options, max_episode_steps=None)
     try:
-        model, normalisation = load_policy(run.policy(which), run.config.algo, env, training=False)
+        policy, normalisation = load_policy(run.policy(which), run.config, env)
         simulation = env.env.simulation
         observation, _ = env.env.reset(seed=run.config.seed)
         history: dict[str, list[NDArray[np.float64]]] = {}
         for _ in range(MAX_EPISODE_STEPS):
             seen: Any = normalisation.normalize_obs(observation)
-            action, _ = model.predict(seen, deterministic=True)
+            action, _ = policy.predict(seen, deterministic=True)
             observation, reward, _, _, info = env.env.step(env.targets(action))
             torque = info.get("joint_torque", np.full((episodes, 1), np.nan))
             step = {

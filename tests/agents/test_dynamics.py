@@ -12,7 +12,7 @@ import pytest
 
 from gym_mara.agents.callbacks import Report
 from gym_mara.agents.evaluate import evaluate_run, make_env
-from gym_mara.agents.presets import PRESETS, Preset
+from gym_mara.agents.presets import Preset
 from gym_mara.agents.run import RunFolder
 from gym_mara.agents.train import resume, train
 from gym_mara.agents.transfer import SETTLED, _settled_after, transfer
@@ -30,9 +30,7 @@ def _train(out: Path, report: Report = silent, updates: int = 2) -> RunFolder:
     options = {"randomisation": {"mass": [0.9, 1.1], "sensor_noise": [0.0, 1e-3]}}
     about: dict[str, Any] = {"env": "MARA-v0", "backend": "dart", "env_options": options}
     about |= {"steps": updates * ROLLOUT, "checkpoint_every": ROLLOUT}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "ppo", (SMALL, SMALL))
-        return train(config(**about), out, report)
+    return train(config(**about), out, report, preset=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -130,4 +128,4 @@ def test_a_policy_of_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
 
     env = make_env("MARAOrient-v0", "pinocchio", 1, {})
     with pytest.raises(GymMaraError, match="does not fit the environment"):
-        load_policy(dynamic_run.policy("last"), "ppo", env, training=False)
+        load_policy(dynamic_run.policy("last"), dynamic_run.config, env)

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from sb3_contrib import TRPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import kl_divergence
 from torch.distributions import MultivariateNormal
 
 from gym_mara.agents.evaluate import make_env
@@ -42,6 +44,27 @@ def test_it_is_the_gaussian_that_its_parameters_say(distribution: NaturalGaussia
     expected = referee.entropy()  # type: ignore[no-untyped-call]
     torch.testing.assert_close(distribution.entropy(), expected)
     torch.testing.assert_close(distribution.mode(), referee.mean)
+
+
+def test_its_divergence_is_that_of_the_gaussians(distribution: NaturalGaussian) -> None:
+    generator = torch.Generator().manual_seed(2)
+    noise = 0.1 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    other = NaturalGaussian().proba_distribution(
+        distribution.mean + 0.1,
+        distribution.log_scale + noise + noise.T,
+        distribution.centre,
+        distribution.factor,
+    )
+    expected = torch.distributions.kl_divergence(_referee(distribution), _referee(other))
+    torch.testing.assert_close(kl_divergence(distribution, other), expected)
+
+
+def test_trpo_moves_it_within_its_trust_region() -> None:
+    env = make_env("MARAOrient-v0", "pinocchio", 16, {})
+    model = TRPO(NaturalGaussianPolicy, env, n_steps=16, target_kl=0.02, seed=0, device="cpu")
+    for _ in range(3):
+        model.learn(16 * 16, reset_num_timesteps=False)
+        assert 1e-3 < model.logger.name_to_value["train/kl_divergence_loss"] <= 0.02
 
 
 def test_samples_have_its_mean_and_covariance(distribution: NaturalGaussian) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import pickle
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 
 from gym_mara.agents.evaluate import METRICS, evaluate_run, make_env, spread
 from gym_mara.agents.policy import load_policy
@@ -25,8 +30,8 @@ from tests.agents.conftest import ROLLOUT, config, silent
 def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
     """The weights of a run's policy."""
     env = make_env(run.config.env, run.config.backend, 1, {})
-    model, _ = load_policy(run.path / which, run.config.algo, env, training=False)
-    return dict(model.policy.state_dict())
+    policy, _ = load_policy(run.path / which, run.config, env)
+    return dict(policy.state_dict())
 
 
 def assert_same_training(run: RunFolder, other: RunFolder) -> None:
@@ -50,7 +55,7 @@ def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
     assert [int(p.name) for p in finished_run.checkpoints()] == [ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
     for folder in (path / "best", path / "last", *finished_run.checkpoints()):
         assert (folder / "model.zip").is_file()
-        assert (folder / "normalisation.pkl").is_file()
+        assert (folder / "normalisation.json").is_file()
     assert list((path / "tensorboard").glob("events*"))
     assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     rows = read_progress(finished_run.progress_file)
@@ -200,7 +205,7 @@ def copy_of(run: RunFolder, path: Path) -> RunFolder:
     return RunFolder.open(path)
 
 
-@pytest.mark.parametrize("file", ["model.zip", "normalisation.pkl"])
+@pytest.mark.parametrize("file", ["model.zip", "normalisation.json"])
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut"])
 def test_a_damaged_policy_is_named(
     finished_run: RunFolder, tmp_path: Path, file: str, damage: str
@@ -213,6 +218,42 @@ def test_a_damaged_policy_is_named(
         victim.write_bytes(content[: 0 if damage == "empty" else len(content) // 2])
     with pytest.raises(GymMaraError, match="run"):
         evaluate_run(run)
+
+
+def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    trap = tmp_path / "trap"
+    file = run.path / "last" / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    about = json.loads(parts["data"])
+    pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
+    about["clip_range"] = {":type:": "", ":serialized:": pickled}
+    parts["data"] = json.dumps(about).encode()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    evaluate_run(run, episodes=1)
+    assert not trap.exists()
+    PPO.load(file)
+    assert trap.exists(), "Stable-Baselines3's own way runs it"
+
+
+class Trap:
+    """Makes a file where it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _spring, (self.path,)
+
+
+def _spring(path: Path) -> float:
+    path.touch()
+    return 0.2
 
 
 def test_a_damaged_checkpoint_is_named(finished_run: RunFolder, tmp_path: Path) -> None:
