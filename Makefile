@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint bench accuracy test-oldest test-wheel clean
+.PHONY: demo test lint bench experiment test-oldest test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
@@ -22,8 +22,8 @@ bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/dynamics.py
 
-accuracy: $(READY) ## Train three seeds of 1M steps on each environment and print their accuracy; half an hour.
-	$(BIN)/python benchmarks/accuracy.py
+experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
+	$(BIN)/gym-mara benchmark --out runs/experiment
 
 test-oldest: ## Run the tests with the oldest Gymnasium that is supported.
 	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt

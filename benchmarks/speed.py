@@ -20,7 +20,7 @@ import gymnasium
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from training import training_ratio
+from training import print_training
 
 import gym_mara
 from gym_mara.robot import RobotModel
@@ -187,8 +187,7 @@ def main() -> None:
     print_throughput()
     print_peers()
     if not arguments.no_training:
-        print("\n## Training, against the same PPO on an environment that does nothing\n")
-        print(training_ratio())
+        print_training()
 
 
 if __name__ == "__main__":

@@ -45,7 +45,9 @@ def test_list_names_everything(gym_mara: Cli) -> None:
     assert "ur5" in out
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "transfer", "rewards", "list"])
+@pytest.mark.parametrize(
+    "command", ["train", "evaluate", "transfer", "benchmark", "plot", "search", "rewards", "list"]
+)
 def test_help_helps(gym_mara: Cli, command: str) -> None:
     code, out, _ = gym_mara(command, "--help")
     assert code == 0
@@ -119,6 +121,13 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
             "max_joint_velocity must be finite and positive",
         ),
         (["train", "--resume", "nowhere"], "is no run folder"),
+        (["train", "--resume", "nowhere", "--steps", "5", "--algo", "ppo"], "leave out"),
+        (["train", "--preset", "papers", "--out", "x"], "unknown preset 'papers'"),
+        (["benchmark", "--algos", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
+        (["benchmark", "--envs", "MARA-v1", "--out", "x"], "unknown environment 'MARA-v1'"),
+        (["benchmark", "--jobs", "0", "--out", "x"], "--jobs must be"),
+        (["plot", "nowhere"], "is no grid"),
+        (["search", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
         (["evaluate", "nowhere"], "is no run folder"),
         (["rewards"], "either --record FILE or --check FILE"),
         (["rewards", "--check", "nowhere.csv"], "cannot read"),

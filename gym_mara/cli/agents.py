@@ -1,9 +1,8 @@
-"""The command `gym-mara`."""
+"""gym-mara train, evaluate and transfer: one run."""
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -13,26 +12,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Column, Table
-from rich.text import Text
 
-from gym_mara import regression
-from gym_mara.backends import backend_names
-from gym_mara.errors import GymMaraError, MissingExtraError
-from gym_mara.robot.catalog import robot_names
-from gym_mara.tasks import TASKS
+from gym_mara.cli.common import (
+    BackendOption,
+    EnvOption,
+    SetOption,
+    interruptible,
+    keyword_arguments,
+    needs_agents,
+    out,
+    task_name,
+    whole,
+)
+from gym_mara.errors import GymMaraError
 
 if TYPE_CHECKING:
     from gym_mara.agents.run import RunFolder
 
-app = typer.Typer(
-    help="Train, evaluate and guard agents for the robot arm MARA.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-_out = Console()
 _UNITS = {
     "position_error_mm": "position error, mm",
     "angle_deg": "angle, deg",
@@ -41,32 +38,23 @@ _UNITS = {
     "collisions": "collisions",
 }
 
-EnvOption = Annotated[str, typer.Option("--env", help="Environment: " + ", ".join(TASKS) + ".")]
-BackendOption = Annotated[str, typer.Option(help="Backend: see gym-mara list.")]
-SetOption = Annotated[
-    list[str],
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Keyword argument of the environment, as JSON, such as --set max_joint_velocity=1.57 "
-        "or --set robot=ur5. May be repeated.",
-    ),
-]
 
-
-@app.command()
 def train(
+    context: typer.Context,
     env: EnvOption = "MARA-v0",
-    algo: Annotated[str, typer.Option(help="Algorithm: ppo.")] = "ppo",
+    algo: Annotated[str, typer.Option(help="Algorithm: ppo, trpo or acktr.")] = "ppo",
     backend: BackendOption = "pinocchio",
     steps: Annotated[
         float, typer.Option(help="Environment steps over all arms, such as 1e6.")
     ] = 1e6,
     seed: Annotated[int, typer.Option(help="Seed of policy, sampling and environment.")] = 0,
-    out: Annotated[
+    out_folder: Annotated[
         Path | None,
-        typer.Option(help="New run folder; by default one under runs/ named after run and time."),
+        typer.Option(
+            "--out", help="New run folder; by default one under runs/ named after run and time."
+        ),
     ] = None,
+    preset: Annotated[str, typer.Option(help="Hyperparameters: tuned or paper.")] = "tuned",
     checkpoint_every: Annotated[
         float, typer.Option(help="Steps between two checkpoints, each of which is evaluated.")
     ] = 5e4,
@@ -77,33 +65,53 @@ def train(
     ] = None,
 ) -> None:
     """Train an agent and leave a run folder: policy, checkpoints, learning curve, TensorBoard log."""
-    with _agents():
+    with needs_agents():
         from gym_mara.agents.run import RunConfig, RunFolder
         from gym_mara.agents.train import resume as go_on
         from gym_mara.agents.train import train as begin
 
     if resume is not None:
+        _refuse_beside_resume(context)
+        out.print(
+            "Going on unpickles the run's checkpoint, and a pickle can run any code: "
+            "do so only with runs that you trust.",
+            style="yellow",
+            soft_wrap=True,
+        )
         with _progress(RunFolder.open(resume).config.steps, resume) as report:
             run = go_on(resume, report)
     else:
         config = RunConfig(
-            env=_task(env),
+            env=task_name(env),
             algo=algo,
             backend=backend,
-            steps=_whole("--steps", steps),
+            steps=whole("--steps", steps),
             seed=seed,
-            checkpoint_every=_whole("--checkpoint-every", checkpoint_every),
-            env_options=_options(settings),
+            checkpoint_every=whole("--checkpoint-every", checkpoint_every),
+            preset_name=preset,
+            env_options=keyword_arguments(settings),
         )
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = out or Path("runs") / f"{algo}_{config.env}_{backend}_seed{seed}_{stamp}"
+        folder = out_folder or Path("runs") / f"{algo}_{config.env}_{backend}_seed{seed}_{stamp}"
         with _progress(config.steps, folder) as report:
             run = begin(config, folder, report)
     _print_evaluation(run, episodes=1)
-    _out.print(f"Run folder: {run.path}", soft_wrap=True)
+    out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 
-@app.command()
+def _refuse_beside_resume(context: typer.Context) -> None:
+    """A run goes on as it was begun: raises GymMaraError where other options were given."""
+    given = []
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name != "resume" and source is not None and source.name == "COMMANDLINE":
+            given.append(parameter.opts[0])
+    if given:
+        raise GymMaraError(
+            f"--resume goes on with a run as it was begun: leave out {', '.join(given)}"
+        )
+
+
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run folder.")],
     backend: Annotated[
@@ -116,7 +124,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
 ) -> None:
     """Play a run's deterministic policy: position error and angle at the last step, reward, collisions."""
-    with _agents():
+    with needs_agents():
         from gym_mara.agents.evaluate import evaluate_run, spread
         from gym_mara.agents.run import RunFolder
 
@@ -128,7 +136,6 @@ def evaluate(
         _print_evaluation(folder, backend=backend, episodes=episodes, which=policy)
 
 
-@app.command()
 def transfer(
     run: Annotated[Path, typer.Argument(help="A run folder.")],
     episodes: Annotated[int, typer.Option(help="How many episodes to play on each backend.")] = 1,
@@ -136,12 +143,12 @@ def transfer(
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
     """Play a run's policy on every backend, side by side: what it loses between simulations."""
-    with _agents():
+    with needs_agents():
         from gym_mara.agents.run import RunFolder
         from gym_mara.agents.transfer import transfer as play
 
     folder = RunFolder.open(run)
-    rows = play(folder, episodes=episodes, which=policy, options=_options(settings))
+    rows = play(folder, episodes=episodes, which=policy, options=keyword_arguments(settings))
     names = (
         "position error, mm",
         "angle, deg",
@@ -155,75 +162,7 @@ def transfer(
     table = Table("", *titles, title=f"{folder.config.env}, {policy} policy")
     for index, name in enumerate(names, start=1):
         table.add_row(name, *(_mean_and_spread(np.asarray(row[index])) for row in rows))
-    _out.print(table)
-
-
-@app.command("list")
-def list_() -> None:
-    """Show the environments, the backends and the robots."""
-    columns = Column("environment", no_wrap=True), "reward uses", "on a collision"
-    table = Table(*columns, title="Environments")
-    for name, task in TASKS.items():
-        uses = ["distance"]
-        uses += ["orientation"] if getattr(task, "orientation", False) else []
-        uses += ["collision"] if getattr(task, "collision_penalty", False) else []
-        table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
-    _out.print(table)
-    _out.print("Backends:", ", ".join(backend_names()))
-    _out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
-
-
-@app.command()
-def rewards(
-    record: Annotated[Path | None, typer.Option(help="New file to write the rewards to.")] = None,
-    check: Annotated[
-        Path | None, typer.Option(help="Recorded file to compute anew; exits 1 if a value moved.")
-    ] = None,
-    env: EnvOption = "MARA-v0",
-    backend: Annotated[
-        str | None,
-        typer.Option(help="Backend; by default pinocchio, or with --check the record's own."),
-    ] = None,
-    states: Annotated[int, typer.Option(help="How many states to record.")] = 256,
-    tolerance: Annotated[float, typer.Option(help="How far a value may move.")] = 1e-9,
-    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
-) -> None:
-    """Guard a reward function: record its values over a fixed grid of states, or check them."""
-    if (record is None) == (check is None):
-        raise GymMaraError("say either --record FILE or --check FILE")
-    if record is not None:
-        made = regression.record(_task(env), backend or "pinocchio", _options(settings), states)
-        regression.write(record, made)
-        _out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")
-    if check is not None:
-        moved = regression.check(check, backend, tolerance)
-        for value in moved:
-            print(value)
-        if moved:
-            print(f"{len(moved)} values of {check} moved by more than {tolerance:g}")
-            raise typer.Exit(1)
-        _out.print(f"{check}: nothing moved by more than {tolerance:g}")
-
-
-def main() -> None:
-    """Run the command; what the user can mend is told in a line, without a traceback."""
-    try:
-        app()
-    except GymMaraError as error:
-        # A Text, not a string: an extra's brackets are no markup.
-        text = Text.assemble(("error: ", "bold red"), str(error))
-        Console(stderr=True).print(text, soft_wrap=True)
-        sys.exit(2)
-
-
-@contextmanager
-def _agents() -> Iterator[None]:
-    """Names the extra where a library that training needs is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        library = error.name or str(error)
-        raise MissingExtraError("training and evaluation", library, "train") from error
+    out.print(table)
 
 
 @contextmanager
@@ -241,10 +180,10 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
         f"Interrupted. What was trained up to the last checkpoint is kept; go on with\n"
         f"gym-mara train --resume {run}"
     )
-    bar = Progress(*columns, console=_out)
+    bar = Progress(*columns, console=out)
     task = bar.add_task("", total=total)
 
-    with _interruptible(interrupted):
+    with interruptible(interrupted):
 
         def report(steps: int, shown: dict[str, float]) -> None:
             bar.start()  # once the training begins: what is refused before shows no bar
@@ -259,15 +198,6 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
             bar.stop()
 
 
-@contextmanager
-def _interruptible(message: str) -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        _out.print(message, soft_wrap=True)
-        raise typer.Exit(130) from None
-
-
 def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
     from gym_mara.agents.evaluate import evaluate_run, spread
 
@@ -278,7 +208,7 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
     table = Table("", "mean", "std", "min", "max", title=title)
     for name, values in spread(metrics).items():
         table.add_row(_UNITS[name], *(f"{value:.2f}" for value in values.values()))
-    _out.print(table)
+    out.print(table)
 
 
 def _mean_and_spread(values: NDArray[np.float64]) -> str:
@@ -286,39 +216,3 @@ def _mean_and_spread(values: NDArray[np.float64]) -> str:
     if np.isnan(mean):
         return "-"
     return f"{mean:.2f}" + (f" ± {spread:.2f}" if len(values) > 1 else "")
-
-
-def _task(env: str) -> str:
-    """The name of a task, with or without the namespace of its id."""
-    name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
-    if name not in TASKS:
-        from gym_mara.errors import unknown
-
-        raise unknown("environment", env, TASKS)
-    return name
-
-
-def _whole(option: str, value: float) -> int:
-    if not (value >= 1 and value == value // 1):
-        raise GymMaraError(f"{option} must be a whole number of at least 1, not {value:g}")
-    return int(value)
-
-
-def _options(settings: list[str]) -> dict[str, Any]:
-    """Keyword arguments from NAME=VALUE; a value that is not JSON is a string."""
-    options = {}
-    for setting in settings:
-        name, separator, value = setting.partition("=")
-        if not separator or not name.isidentifier():
-            raise GymMaraError(f"--set {setting!r}: write NAME=VALUE")
-        try:
-            options[name] = json.loads(value)
-        except ValueError as error:
-            if value.lstrip().startswith(("{", "[", '"')):
-                raise GymMaraError(f"--set {setting}: the value is not JSON: {error}") from None
-            options[name] = value
-    return options
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,98 @@
+"""Tasks in processes of their own: what they say is heard, one that dies is told, an interrupt leaves none behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from gym_mara.errors import GymMaraError, whole_number
+
+Say = Callable[[Any], None]
+Task = Callable[[Say], None]
+
+# Several processes share the cores; none may use them all for itself.
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+def run_tasks(
+    tasks: Mapping[str, Task],
+    jobs: int,
+    hear: Callable[[str, Any], None],
+    *,
+    patience: float = 0.5,
+) -> dict[str, str]:
+    """Run tasks, so many at a time, each in a new process.
+
+    Args:
+        tasks: name → what to do; it pickles, and is given a function by which to say things.
+        jobs: how many at a time.
+        hear: called with a task's name and what it said, and every `patience` seconds with ("", None).
+        patience: s.
+
+    Returns:
+        Name → what went wrong, of the tasks that failed; the others go on.
+
+    Raises:
+        GymMaraError: jobs is no whole number of at least 1.
+        KeyboardInterrupt: the user interrupted; no process is left.
+    """
+    jobs = whole_number("jobs", jobs)
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    waiting = list(tasks.items())
+    running: dict[Connection, tuple[str, Any]] = {}
+    failed: dict[str, str] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                name, task = waiting.pop(0)
+                mouth, ear = _SPAWN.Pipe(duplex=False)[::-1]
+                process = _SPAWN.Process(target=_work, args=(task, mouth), name=name)
+                process.start()
+                mouth.close()
+                running[ear] = name, process
+            heard = wait(list(running), timeout=patience)
+            for ear in [ear for ear in running if ear in heard]:
+                name, process = running[ear]
+                try:
+                    kind, message = ear.recv()
+                except (EOFError, OSError):
+                    process.join()
+                    del running[ear]
+                    if process.exitcode:
+                        failed.setdefault(name, f"its process ended with {process.exitcode}")
+                    continue
+                if kind == "failed":
+                    failed[name] = message
+                else:
+                    hear(name, message)
+            hear("", None)
+    finally:
+        for _, process in running.values():
+            process.terminate()
+        for _, process in running.values():
+            process.join()
+    return failed
+
+
+def _work(task: Task, mouth: Connection) -> None:
+    """In the process: do the task; what the user can mend is told in a line."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
+
+    def say(message: Any) -> None:
+        try:
+            mouth.send(("said", message))
+        except OSError:
+            os._exit(1)  # nobody is left to hear
+
+    try:
+        task(say)
+    except (GymMaraError, OSError) as error:
+        with suppress(OSError):
+            mouth.send(("failed", str(error)))

@@ -1,0 +1,79 @@
+"""What the commands share: the console, common options, and how their values are read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.tasks import TASKS
+
+out = Console()
+
+EnvOption = Annotated[str, typer.Option("--env", help="Environment: " + ", ".join(TASKS) + ".")]
+BackendOption = Annotated[str, typer.Option(help="Backend: see gym-mara list.")]
+SetOption = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Keyword argument of the environment, as JSON, such as --set max_joint_velocity=1.57 "
+        "or --set robot=ur5. May be repeated.",
+    ),
+]
+
+
+@contextmanager
+def needs_agents() -> Iterator[None]:
+    """Name the extra where a library that training needs is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = error.name or str(error)
+        raise MissingExtraError("training and evaluation", library, "train") from error
+
+
+@contextmanager
+def interruptible(message: str) -> Iterator[None]:
+    """End with a message where the user interrupts."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        out.print(message, soft_wrap=True)
+        raise typer.Exit(130) from None
+
+
+def task_name(env: str) -> str:
+    """The name of a task, with or without the namespace of its id."""
+    name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
+    if name not in TASKS:
+        raise unknown("environment", env, TASKS)
+    return name
+
+
+def whole(option: str, value: float) -> int:
+    """The value of an option that must be a whole number of at least 1; 1e6 is one."""
+    if not (value >= 1 and value == value // 1):
+        raise GymMaraError(f"{option} must be a whole number of at least 1, not {value:g}")
+    return int(value)
+
+
+def keyword_arguments(settings: list[str]) -> dict[str, Any]:
+    """Keyword arguments from NAME=VALUE; a value that is not JSON is a string."""
+    options = {}
+    for setting in settings:
+        name, separator, value = setting.partition("=")
+        if not separator or not name.isidentifier():
+            raise GymMaraError(f"--set {setting!r}: write NAME=VALUE")
+        try:
+            options[name] = json.loads(value)
+        except ValueError as error:
+            if value.lstrip().startswith(("{", "[", '"')):
+                raise GymMaraError(f"--set {setting}: the value is not JSON: {error}") from None
+            options[name] = value
+    return options

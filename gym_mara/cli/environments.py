@@ -1,0 +1,63 @@
+"""gym-mara list and rewards: what needs no agents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Column, Table
+
+from gym_mara import regression
+from gym_mara.backends import backend_names
+from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out, task_name
+from gym_mara.errors import GymMaraError
+from gym_mara.robot.catalog import robot_names
+from gym_mara.tasks import TASKS
+
+
+def list_() -> None:
+    """Show the environments, the backends and the robots."""
+    columns = Column("environment", no_wrap=True), "reward uses", "on a collision"
+    table = Table(*columns, title="Environments")
+    for name, task in TASKS.items():
+        uses = ["distance"]
+        uses += ["orientation"] if getattr(task, "orientation", False) else []
+        uses += ["collision"] if getattr(task, "collision_penalty", False) else []
+        table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
+    out.print(table)
+    out.print("Backends:", ", ".join(backend_names()))
+    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
+
+
+def rewards(
+    record: Annotated[Path | None, typer.Option(help="New file to write the rewards to.")] = None,
+    check: Annotated[
+        Path | None, typer.Option(help="Recorded file to compute anew; exits 1 if a value moved.")
+    ] = None,
+    env: EnvOption = "MARA-v0",
+    backend: Annotated[
+        str | None,
+        typer.Option(help="Backend; by default pinocchio, or with --check the record's own."),
+    ] = None,
+    states: Annotated[int, typer.Option(help="How many states to record.")] = 256,
+    tolerance: Annotated[float, typer.Option(help="How far a value may move.")] = 1e-9,
+    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+) -> None:
+    """Guard a reward function: record its values over a fixed grid of states, or check them."""
+    if (record is None) == (check is None):
+        raise GymMaraError("say either --record FILE or --check FILE")
+    if record is not None:
+        made = regression.record(
+            task_name(env), backend or "pinocchio", keyword_arguments(settings), states
+        )
+        regression.write(record, made)
+        out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")
+    if check is not None:
+        moved = regression.check(check, backend, tolerance)
+        for value in moved:
+            print(value)
+        if moved:
+            print(f"{len(moved)} values of {check} moved by more than {tolerance:g}")
+            raise typer.Exit(1)
+        out.print(f"{check}: nothing moved by more than {tolerance:g}")

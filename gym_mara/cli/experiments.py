@@ -1,0 +1,209 @@
+"""gym-mara benchmark, plot and search: many runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.table import Table
+
+from gym_mara.cli.common import (
+    BackendOption,
+    EnvOption,
+    interruptible,
+    needs_agents,
+    out,
+    task_name,
+    whole,
+)
+from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.tasks import TASKS
+
+if TYPE_CHECKING:
+    from gym_mara.agents.benchmark import Grid
+
+StepsOption = Annotated[float, typer.Option(help="Environment steps of each run, such as 1e6.")]
+JobsOption = Annotated[
+    int | None, typer.Option(help="How many runs at a time; by default one a core.")
+]
+
+
+def benchmark(
+    envs: Annotated[str, typer.Option(help="Environments, with commas between them.")] = ",".join(
+        TASKS
+    ),
+    algos: Annotated[
+        str, typer.Option(help="Algorithms, with commas between them.")
+    ] = "ppo,trpo,acktr",
+    seeds: Annotated[int, typer.Option(help="Runs of each pair, with the seeds 0, 1, …")] = 3,
+    steps: StepsOption = 1e6,
+    preset: Annotated[str, typer.Option(help="Hyperparameters: tuned or paper.")] = "tuned",
+    backend: BackendOption = "pinocchio",
+    checkpoint_every: Annotated[
+        float, typer.Option(help="Steps between two checkpoints of a run.")
+    ] = 5e4,
+    jobs: JobsOption = None,
+    out_folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the grid; one that was cut off is gone on with."),
+    ] = None,
+) -> None:
+    """Train every algorithm on every environment with every seed; may be killed and started again."""
+    with needs_agents():
+        from gym_mara.agents.benchmark import Grid, run_grid
+        from gym_mara.agents.figures import plot_grid
+
+    grid = Grid(
+        envs=tuple(task_name(env) for env in envs.split(",")),
+        algos=tuple(algos.split(",")),
+        seeds=seeds,
+        steps=whole("--steps", steps),
+        preset_name=preset,
+        backend=backend,
+        checkpoint_every=whole("--checkpoint-every", checkpoint_every),
+    )
+    workers = _jobs(jobs)
+    folder = out_folder or Path("runs") / f"benchmark_{preset}"
+    with interruptible(
+        "Interrupted. What has finished is kept, and runs go on from their last checkpoint:\n"
+        "give the same command again"
+    ):
+        view = _GridView(folder, grid)
+        with Live(get_renderable=view.table, console=out, refresh_per_second=2) as live:
+            view.notice = live.console.print
+            failed = run_grid(folder, grid, workers, view.hear)
+    for name, reason in failed.items():
+        out.print(f"{name} failed: {reason}", style="red", markup=False, soft_wrap=True)
+    if len(failed) < len(grid.runs()):
+        for file in plot_grid(folder):
+            out.print(str(file), soft_wrap=True)
+    if failed:
+        raise GymMaraError(
+            f"{len(failed)} of {len(grid.runs())} runs failed; mend what stopped them and give the same command again"
+        )
+
+
+def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:
+    """Draw a benchmark's figures and write its tables."""
+    with needs_agents():
+        from gym_mara.agents.figures import plot_grid
+
+    for file in plot_grid(folder):
+        out.print(str(file), soft_wrap=True)
+    out.print((folder / "table.md").read_text(), markup=False, soft_wrap=True)
+
+
+def search(
+    env: EnvOption = "MARACollisionOrient-v0",
+    algo: Annotated[str, typer.Option(help="Algorithm: ppo, trpo or acktr.")] = "ppo",
+    steps: StepsOption = 1e6,
+    trials: Annotated[int, typer.Option(help="How many trials in all.")] = 40,
+    seeds: Annotated[int, typer.Option(help="How many runs make a trial.")] = 1,
+    jobs: JobsOption = None,
+    out_folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the search; one that was cut off is gone on with."),
+    ] = None,
+) -> None:
+    """Search an algorithm's hyperparameters with Optuna, on seeds that no result is reported of."""
+    with needs_agents():
+        from gym_mara.agents import search as of
+        from gym_mara.agents.parallel import run_tasks
+
+    workers = _jobs(jobs)
+    wanted = of.Search(task_name(env), algo, whole("--steps", steps), trials, seeds)
+    folder = out_folder or Path("runs") / f"search_{algo}_{wanted.env}"
+    study = of.open_study(wanted, folder)
+
+    def hear(name: str, message: Any) -> None:
+        if message is not None:
+            out.print(f"{message} of {trials} trials", _best(study), soft_wrap=True)
+
+    with interruptible("Interrupted. Trials that have ended are kept: give the same command again"):
+        tasks = {f"worker {i}": partial(of.work, wanted, folder) for i in range(workers)}
+        failed = run_tasks(tasks, workers, hear)
+    if failed:
+        raise GymMaraError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+    out.print(_best(study), soft_wrap=True)
+
+
+def _best(study: Any) -> str:
+    """The best trial so far, as text."""
+    done = [trial for trial in study.trials if trial.value is not None]
+    if not done:
+        return "none finished yet"
+    best = min(done, key=lambda trial: trial.value)
+    return f"best: {best.value:.3f} {json.dumps(best.params)}"
+
+
+def _jobs(jobs: int | None) -> int:
+    return len(os.sched_getaffinity(0)) if jobs is None else whole_number("--jobs", jobs)
+
+
+class _GridView:
+    """The state of a grid's runs, as a table."""
+
+    def __init__(self, folder: Path, grid: Grid) -> None:
+        from gym_mara.agents.benchmark import read_result
+
+        self._grid = grid
+        self._began = time.monotonic()
+        self._steps: dict[str, int] = {}
+        self._shown: dict[str, dict[str, float]] = {}
+        for name in grid.runs():
+            result = read_result(folder / name)
+            if result is not None:
+                self._steps[name] = grid.steps
+                self._shown[name] = {"eval_position_error_mm": result["last"]["position_error_mm"]}
+        self._first: dict[str, int] = dict(self._steps)
+        self.notice: Any = out.print
+
+    def hear(self, name: str, message: Any) -> None:
+        """Take up what a run says."""
+        if isinstance(message, str):
+            self.notice(f"{name}: {message}", style="yellow", markup=False, soft_wrap=True)
+        elif message is not None:
+            steps, shown = message
+            self._first.setdefault(name, steps)
+            self._steps[name] = min(steps, self._grid.steps)
+            self._shown[name] = shown
+
+    def table(self) -> Table:
+        """A cell for each pair of environment and algorithm: its runs' progress and position errors."""
+        total = self._grid.steps * len(self._grid.runs())
+        done = sum(self._steps.values())
+        fresh = done - sum(min(first, self._grid.steps) for first in self._first.values())
+        seconds = time.monotonic() - self._began
+        left = (total - done) * seconds / fresh if fresh else None
+        title = f"{done / total:.0%} of {len(self._grid.runs())} runs, {_clock(seconds)} so far"
+        table = Table("", *(a.upper() for a in self._grid.algos), title=title)
+        table.caption = f"{_clock(left)} left" if left is not None else None
+        for env in self._grid.envs:
+            cells = (self._cell(env, algo) for algo in self._grid.algos)
+            table.add_row(env, *cells)
+        return table
+
+    def _cell(self, env: str, algo: str) -> str:
+        parts = []
+        for name, run in self._grid.runs().items():
+            if (run.env, run.algo) != (env, algo):
+                continue
+            part = f"{self._steps.get(name, 0) / self._grid.steps:4.0%}"
+            error = self._shown.get(name, {}).get("eval_position_error_mm")
+            parts.append(part + (f" {error:7.2f} mm" if error is not None else ""))
+        return "\n".join(parts)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return (
+        f"{minutes} min {rest:02d} s"
+        if minutes < 60
+        else f"{minutes // 60} h {minutes % 60:02d} min"
+    )

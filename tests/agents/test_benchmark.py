@@ -1,0 +1,225 @@
+"""The grid of runs: it finishes what was begun, keeps what has finished, and sets aside what is damaged."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gym_mara.agents.benchmark import Grid, open_grid, read_result, run_grid
+from gym_mara.agents.figures import format_interval, interquartile_mean, plot_grid
+from gym_mara.agents.parallel import Say, run_tasks
+from gym_mara.errors import GymMaraError
+
+GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
+
+
+def deaf(name: str, message: Any) -> None:
+    """What the runs say is not heard."""
+
+
+@pytest.fixture(scope="session")
+def finished_grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A grid that was trained to its end; tests must not change it."""
+    folder = Path(tmp_path_factory.mktemp("grids")) / "grid"
+    assert run_grid(folder, GRID, 2, deaf) == {}
+    return folder
+
+
+def test_every_run_leaves_its_result(finished_grid: Path) -> None:
+    assert set(GRID.runs()) == {f"MARA-v0_{algo}_0" for algo in GRID.algos}
+    for name in GRID.runs():
+        result = read_result(finished_grid / name)
+        assert result is not None
+        assert result["last"]["position_error_mm"] > 0.0
+        assert result["seconds"] > 0.0
+
+
+def test_what_has_finished_is_not_trained_again(finished_grid: Path) -> None:
+    said: list[str] = []
+    assert run_grid(finished_grid, GRID, 1, lambda name, message: said.append(name)) == {}
+    assert not any(said)
+
+
+def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "grid"
+    options = ["--envs", "MARA-v0", "--algos", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
+    command = [sys.executable, "-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
+    command += ["--checkpoint-every", "2048", "--out", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(folder.glob("*/checkpoints/2*")):
+        assert process.poll() is None, "the grid ended early"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert run_grid(folder, GRID, 2, deaf) == {}
+    for name in GRID.runs():
+        mine, theirs = read_result(folder / name), read_result(finished_grid / name)
+        assert mine is not None
+        assert theirs is not None
+        assert mine["last"] == theirs["last"]
+
+
+@pytest.mark.parametrize("victim", ["config.json", "last/model.zip", "progress.csv"])
+def test_a_damaged_run_is_named_set_aside_and_run_again(
+    finished_grid: Path, tmp_path: Path, victim: str
+) -> None:
+    folder, name = tmp_path / "grid", "MARA-v0_acktr_0"
+    shutil.copytree(finished_grid, folder)
+    before = read_result(folder / name)
+    (folder / name / "result.json").unlink()
+    (folder / name / victim).write_bytes(b"\x00 no such thing")
+    said: list[Any] = []
+    assert run_grid(folder, GRID, 1, lambda who, message: said.append((who, message))) == {}
+    assert any(who == name and "set aside" in str(message) for who, message in said)
+    assert (folder / f"{name}.damaged1").is_dir()
+    after = read_result(folder / name)
+    assert before is not None
+    assert after is not None
+    assert after["last"] == before["last"]
+
+
+def test_without_room_to_write_runs_fail_and_can_be_gone_on_with(
+    finished_grid: Path, tmp_path: Path
+) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))  # of any file, as on a full disk
+        failed = run_grid(tmp_path / "grid", GRID, 2, deaf)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert failed.keys() == GRID.runs().keys()
+    assert all("File too large" in reason for reason in failed.values())
+    assert run_grid(tmp_path / "grid", GRID, 2, deaf) == {}
+    for name in GRID.runs():
+        mine, theirs = read_result(tmp_path / "grid" / name), read_result(finished_grid / name)
+        assert mine is not None
+        assert theirs is not None
+        assert mine["last"] == theirs["last"]
+
+
+def test_the_folder_of_another_grid_is_refused(finished_grid: Path, tmp_path: Path) -> None:
+    with pytest.raises(GymMaraError, match=r"another grid .*steps 4096 there, 8192 now"):
+        open_grid(finished_grid, replace(GRID, steps=8192))
+    (tmp_path / "something").touch()
+    with pytest.raises(GymMaraError, match="neither empty nor a grid"):
+        open_grid(tmp_path, GRID)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"envs": ("MARA-v1",)}, "environment"),
+        ({"algos": ("ppo2",)}, "algorithm"),
+        ({"preset_name": "papers"}, "preset"),
+        ({"seeds": 0}, "seeds"),
+        ({"steps": -1}, "steps"),
+    ],
+)
+def test_a_grid_of_nonsense_is_refused(
+    tmp_path: Path, change: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(GymMaraError, match=complaint):
+        open_grid(tmp_path / "grid", replace(GRID, **change))
+    assert not (tmp_path / "grid").exists()
+
+
+def test_figures_and_tables_show_every_run(finished_grid: Path) -> None:
+    files = plot_grid(finished_grid)
+    assert {file.name for file in files} == {
+        "MARA-v0.png",
+        "MARA-v0_acktr.png",
+        "curves.csv",
+        "table.csv",
+        "table.md",
+    }
+    with (finished_grid / "curves.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {(row["algo"], row["seed"]) for row in rows} == {("ppo", "0"), ("acktr", "0")}
+    text = (finished_grid / "table.md").read_text()
+    assert "| MARA-v0 | PPO | 1 |" in text
+    assert "| MARA-v0 | ACKTR | 1 |" in text
+
+
+def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:
+    with pytest.raises(GymMaraError, match=r"no grid\.json"):
+        plot_grid(tmp_path)
+    open_grid(tmp_path / "grid", GRID)
+    with pytest.raises(GymMaraError, match="no run of the grid"):
+        plot_grid(tmp_path / "grid")
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
+    interval = interquartile_mean([1.0, 2.0, 3.0, 1000.0])
+    assert interval.mean == 2.5
+    assert interval.low <= 2.5 <= interval.high
+    assert interquartile_mean([1.0, 2.0, 6.0]).mean == 3.0
+    assert format_interval(interquartile_mean([1.0, 1.0]), 1) == "1.0"
+    assert format_interval(interquartile_mean([1.0, np.inf, np.inf]), 1) == "-"
+
+
+def _dies(say: Say) -> None:
+    say("alive")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _speaks(say: Say) -> None:
+    say("hello")
+
+
+def _errs(say: Say) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_task_whose_process_dies_does_not_stop_the_others() -> None:
+    heard: list[tuple[str, Any]] = []
+    tasks = {"dying": _dies, "full": _errs, "well": _speaks}
+    failed = run_tasks(tasks, 1, lambda name, message: heard.append((name, message)))
+    assert failed.keys() == {"dying", "full"}
+    assert "ended with -9" in failed["dying"]
+    assert "No space left" in failed["full"]
+    assert ("well", "hello") in heard
+
+
+def _sleeps(file: Path, say: Say) -> None:
+    file.write_text(str(os.getpid()))
+    say("up")
+    time.sleep(600)
+
+
+def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
+    def interrupt(name: str, message: Any) -> None:
+        if message == "up":
+            raise KeyboardInterrupt
+
+    file = tmp_path / "pid"
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks({"sleeping": partial(_sleeps, file)}, 1, interrupt)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(file.read_text()), 0)
+
+
+def test_jobs_must_be_a_number_of_processes() -> None:
+    with pytest.raises(GymMaraError, match="jobs"):
+        run_tasks({}, 0, deaf)
+
+
+def test_the_grid_says_what_it_is(finished_grid: Path) -> None:
+    about = json.loads((finished_grid / "grid.json").read_text())
+    assert about["algos"] == ["ppo", "acktr"]
+    assert about["preset_name"] == "tuned"

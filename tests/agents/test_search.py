@@ -1,0 +1,79 @@
+"""The search for hyperparameters: it goes on where it was cut off, and never tunes on seeds that are reported."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gym_mara.agents import presets
+from gym_mara.agents import search as module
+from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.parallel import run_tasks
+from gym_mara.agents.policy import algorithm_class
+from gym_mara.agents.search import (
+    FIRST_SEED,
+    SPACES,
+    Search,
+    finished,
+    open_study,
+    with_values,
+    work,
+)
+from gym_mara.agents.train import new_agent, train
+from gym_mara.errors import GymMaraError
+
+SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
+
+
+def deaf(*arguments: Any) -> None:
+    """Nobody listens."""
+
+
+def test_a_search_goes_on_where_it_was_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds = []
+
+    def remember(config: Any, *arguments: Any, **keywords: Any) -> Any:
+        seeds.append(config.seed)
+        return train(config, *arguments, **keywords)
+
+    monkeypatch.setattr(module, "train", remember)
+    work(SMALL, tmp_path / "study", deaf)
+    study = open_study(SMALL, tmp_path / "study")
+    assert finished(study) == 2
+    more = Search(**{**vars(SMALL), "trials": 3})
+    work(more, tmp_path / "study", deaf)
+    assert finished(open_study(more, tmp_path / "study")) == 3
+    assert len(set(seeds)) == 3
+    assert min(seeds) >= FIRST_SEED
+
+
+def test_several_processes_may_search(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    assert run_tasks({n: partial(work, SMALL, tmp_path) for n in "ab"}, 2, deaf) == {}
+    assert finished(open_study(SMALL, tmp_path)) >= 2
+
+
+def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    with pytest.raises(GymMaraError, match="another search"):
+        open_study(Search(**{**vars(SMALL), "algo": "ppo"}), tmp_path)
+    with pytest.raises(GymMaraError, match="unknown algorithm"):
+        open_study(Search(**{**vars(SMALL), "algo": "ppo2"}), tmp_path / "other")
+
+
+@pytest.mark.parametrize("algo", SPACES)
+def test_every_value_of_a_space_is_one_that_the_algorithm_takes(algo: str) -> None:
+    chosen = {
+        name: space[-1] if isinstance(space, list) else space[1]
+        for name, space in SPACES[algo].items()
+    }
+    preset = with_values(presets.preset(algo, teleports=True), chosen)
+    env = make_env("MARA-v0", "pinocchio", preset.num_envs, {})
+    model = new_agent(algo, preset, env, seed=0)
+    assert isinstance(model, algorithm_class(algo))
+    assert model.n_steps == chosen["n_steps"]
