@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,14 +19,15 @@ from gym_mara.agents.benchmark import Grid, read_grid, read_result
 from gym_mara.agents.evaluate import MAX_EPISODE_STEPS
 from gym_mara.agents.run import RunFolder, read_progress
 from gym_mara.errors import GymMaraError
+from gym_mara.tasks import TASKS
 
 # Metric → where a result has it, and its digits.
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
-    "position error, mm": (("last", "position_error_mm"), 2),
+    "position error, mm": (("last", "position_error_mm"), 4),
     "angle, deg": (("last", "angle_deg"), 2),
     "reward per step": (("last", "reward_per_step"), 2),
     "collisions": (("last", "collisions"), 0),
-    "position error of the best, mm": (("best", "position_error_mm"), 2),
+    "position error of the best, mm": (("best", "position_error_mm"), 4),
     "angle of the best, deg": (("best", "angle_deg"), 2),
     "steps to 10 mm": (("steps_to_10_mm",), 0),
     "wall time, s": (("seconds",), 0),
@@ -110,9 +112,7 @@ def _draw(
     axis.axhline(10.0 * MAX_EPISODE_STEPS, color="grey", linewidth=0.8, linestyle=":")
     axis.set_xlabel("environment steps")
     axis.set_ylabel("mean episode reward in training")
-    axis.set_title(
-        f"{env}, {grid.preset_name} presets, {grid.backend}: mean and std over the seeds"
-    )
+    axis.set_title(f"{env}, {grid.preset_name} presets, {grid.backend}")
     axis.legend(loc="best")
     figure.savefig(file, dpi=110)
     return file
@@ -127,7 +127,9 @@ def _draw_band(
     alone: bool,
 ) -> None:
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
-    axis.plot(steps, mean, color=colour, label=f"{algo.upper()}, {len(lines)} seeds")
+    axis.plot(
+        steps, mean, color=colour, label=f"{algo.upper()}: mean and deviation of {len(lines)} seeds"
+    )
     axis.fill_between(
         steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
     )
@@ -139,10 +141,15 @@ def _draw_band(
 def _episode_reward(
     rows: list[dict[str, float]], steps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The reward of a whole episode at a rollout's mean reward per step, at these numbers of steps."""
+    """The reward of a whole episode, 2048 steps, at the mean reward per step since the last of these numbers of steps."""
     points = [(r["time/total_timesteps"], r[_TRAINING]) for r in rows if _TRAINING in r]
-    x, y = zip(*points, strict=True)
-    return MAX_EPISODE_STEPS * np.interp(steps, x, y)
+    x, y = (np.array(column) for column in zip(*points, strict=True))
+    part = np.searchsorted(steps, x).clip(max=len(steps) - 1)
+    count = np.bincount(part, minlength=len(steps))
+    mean = np.bincount(part, y, len(steps)) / np.maximum(count, 1)
+    there = count > 0
+    filled: NDArray[np.float64] = np.interp(steps, steps[there], mean[there])
+    return MAX_EPISODE_STEPS * filled
 
 
 def _write_curves(file: Path, grid: Grid, curves: dict[str, list[dict[str, float]]]) -> Path:
@@ -181,7 +188,10 @@ def _rows(grid: Grid, results: dict[str, dict[str, Any]]) -> Iterator[dict[str, 
                 continue
             row: dict[str, Any] = {"environment": env, "algorithm": algo, "seeds": len(runs)}
             for title, (path, digits) in COLUMNS.items():
-                row[title] = interquartile_mean([_value(run, path) for run in runs]), digits
+                values = [_value(run, path) for run in runs]
+                if "angle" in title and not getattr(TASKS[env], "orientation", False):
+                    values = [math.inf]  # nobody asked for it
+                row[title] = interquartile_mean(values), digits
             yield row
 
 
@@ -217,5 +227,7 @@ def format_interval(interval: Interval, digits: int) -> str:
     """An interval as a cell of a table; a dash for what has not come about."""
     if not np.isfinite(interval.mean):
         return "-"
+    if interval.mean >= 1.0:
+        digits = min(digits, 2)
     mean, low, high = (f"{value:,.{digits}f}" for value in asdict(interval).values())
     return mean if low == high else f"{mean} [{low}, {high}]"
