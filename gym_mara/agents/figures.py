@@ -127,9 +127,8 @@ def _draw_band(
     alone: bool,
 ) -> None:
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
-    axis.plot(
-        steps, mean, color=colour, label=f"{algo.upper()}: mean and deviation of {len(lines)} seeds"
-    )
+    of = f"mean and deviation of {len(lines)} seeds" if len(lines) > 1 else "one seed"
+    axis.plot(steps, mean, color=colour, label=f"{algo.upper()}, {of}")
     axis.fill_between(
         steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
     )
