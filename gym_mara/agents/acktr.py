@@ -29,7 +29,7 @@ class ACKTR(OnPolicyAlgorithm):
     """Actor-critic using Kronecker-factored trust region (Wu et al. 2017, arXiv 1708.05144).
 
     Each rollout makes one update. Actor and critic are networks of their own, each with its own K-FAC optimiser and trust
-    region. The critic predicts a Gaussian, its variance that of the returns around the critic's values.
+    region. The critic predicts a Gaussian, its variance that of the differences between returns and values.
 
     Args:
         policy: "MlpPolicy", or a class of actor and critic made of linear layers.

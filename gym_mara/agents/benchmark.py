@@ -24,6 +24,7 @@ from gym_mara.agents.run import (
     write_atomically,
 )
 from gym_mara.agents.train import resume, train
+from gym_mara.backends import backend_names
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import TASKS
 
@@ -52,6 +53,8 @@ class Grid:
                 raise unknown("environment", env, TASKS)
         for algo in self.algos:
             algorithm_class(algo)
+        if self.backend not in backend_names():
+            raise unknown("backend", self.backend, backend_names())
         if self.preset_name not in PRESETS:
             raise unknown("preset", self.preset_name, PRESETS)
         for name in ("seeds", "steps", "checkpoint_every"):
@@ -97,7 +100,9 @@ def open_grid(folder: Path, grid: Grid) -> None:
                 f"{str(folder)!r} holds another grid ({'; '.join(differences)}): choose another --out"
             )
         return
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and not folder.is_dir():
+        raise GymMaraError(f"{str(folder)!r} is a file: choose another --out")
+    if folder.exists() and any(entry.name != ".grid.json.tmp" for entry in folder.iterdir()):
         raise GymMaraError(f"{str(folder)!r} is neither empty nor a grid: choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -185,6 +190,11 @@ def _result(run: RunFolder) -> dict[str, Any]:
         raise DamagedRunError(f"the run {str(run.path)!r} is damaged: progress.csv holds no curve")
     column = "eval/position_error_mm"
     near = [r["time/total_timesteps"] for r in rows if column in r and r[column] <= NEAR]
+    for which in POLICIES:
+        if not run.has_policy(which):
+            raise DamagedRunError(
+                f"the run {str(run.path)!r} is damaged: its {which!r} policy is gone"
+            )
     policies = {
         which: {k: float(v.mean()) for k, v in evaluate_run(run, episodes=1, which=which).items()}
         for which in POLICIES

@@ -113,7 +113,7 @@ class KFAC(torch.optim.Optimizer):
             How far the model has moved, as a KL divergence.
 
         Raises:
-            GymMaraError: a gradient is not finite; nothing has changed then.
+            GymMaraError: a gradient is not finite; no parameter has changed then.
         """
         gradients = [self._gradient(group) for group in self.param_groups]
         if not all(gradient.isfinite().all() for gradient in gradients):

@@ -44,7 +44,7 @@ def run_tasks(
     """
     jobs = whole_number("jobs", jobs)
     for name in _ONE_THREAD:
-        os.environ.setdefault(name, "1")
+        os.environ[name] = "1"
     waiting = list(tasks.items())
     running: dict[Connection, tuple[str, Any]] = {}
     failed: dict[str, str] = {}

@@ -159,11 +159,18 @@ def replace_folder(new: Path, target: Path) -> None:
 
 
 def read_progress(file: Path) -> list[dict[str, float]]:
-    """The rows of a table of progress; a cell that is empty is left out of its row."""
-    with file.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    complete = [row for row in rows if row.get("time/total_timesteps")]
-    return [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
+    """The rows of a table of progress; a cell that is empty is left out of its row.
+
+    Raises:
+        DamagedRunError: it is no such table.
+    """
+    try:
+        with file.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        complete = [row for row in rows if row.get("time/total_timesteps")]
+        return [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
+    except (csv.Error, ValueError) as error:
+        raise DamagedRunError(f"the table {str(file)!r} is damaged: {error}") from error
 
 
 def _number(text: str) -> float:

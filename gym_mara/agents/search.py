@@ -75,6 +75,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
     """
     if search.algo not in SPACES:
         raise unknown("algorithm", search.algo, SPACES)
+    folder = folder.resolve()  # Optuna's lock is a link, which a relative path would leave dangling
     folder.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name="search",
@@ -118,11 +119,14 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
             chosen[name] = trial.suggest_float(name, *space, log=True)
     preset = with_values(presets.preset(search.algo, teleports=True), chosen)
     values: list[float] = []
+    last: list[float] = [math.nan]
 
     def report(steps: int, shown: dict[str, float]) -> None:
         say(None)
-        if "eval_reward_per_step" in shown and not values:  # the first run decides
-            trial.report(_shortfall(shown["eval_reward_per_step"]), steps)
+        evaluated = shown.get("eval_reward_per_step")
+        if evaluated is not None and evaluated != last[0] and not values:  # the first run decides
+            last[0] = evaluated
+            trial.report(_shortfall(evaluated), steps)
             if trial.should_prune():
                 raise optuna.TrialPruned
 

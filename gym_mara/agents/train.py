@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
 from collections.abc import Sequence
@@ -161,11 +162,15 @@ def _learn(
 
 def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
     """The table and the TensorBoard log, without what a run that was cut off wrote after its last checkpoint."""
-    rows = read_progress(run.progress_file) if run.progress_file.is_file() else []
+    kept = run.path / "progress.csv.kept"  # until the new table has what the old one had
+    if run.progress_file.is_file() and not kept.is_file():
+        os.replace(run.progress_file, kept)
+    rows = read_progress(kept) if kept.is_file() else []
     table = CSVOutputFormat(str(run.progress_file))
     for row in rows:
         if row["time/total_timesteps"] <= steps:
             table.write(dict(row), {})
+    kept.unlink(missing_ok=True)
     if steps == 0:
         shutil.rmtree(run.path / "tensorboard", ignore_errors=True)
     return [table, TensorBoardOutputFormat(str(run.path / "tensorboard"))]

@@ -43,10 +43,10 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
         return workers
     if multiprocessing.current_process().daemon:
         return 1  # a worker itself: it may have none of its own
-    return max(n for n in range(1, len(_cores()) + 1) if num_envs % n == 0)
+    return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)
 
 
-def _cores() -> list[int]:
+def cores() -> list[int]:
     """The numbers of the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
@@ -83,17 +83,17 @@ class WorkerBackend(Backend):
         self._sizes = (robot.num_joints, robot.num_joints, 3, 4, 3, 1, 1, 1, 1)
         size = num_envs // workers
 
-        here, cores = os.getpid(), _cores()
+        here, numbers = os.getpid(), cores()
 
         def block(index: int) -> Callable[[], _Block]:
             def make() -> _Block:
                 # One core each where they fill them all: the scheduler wakes several on one, its waker's.
                 if (
                     os.getpid() != here
-                    and len(cores) == workers
+                    and len(numbers) == workers
                     and hasattr(os, "sched_setaffinity")
                 ):
-                    os.sched_setaffinity(0, {cores[index]})
+                    os.sched_setaffinity(0, {numbers[index]})
                 return _Block(backend(robot, size, **settings), index, sum(self._sizes))
 
             return make

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
+from gym_mara.backends.workers import cores
 from gym_mara.cli.common import (
     BackendOption,
     EnvOption,
@@ -56,7 +56,7 @@ def benchmark(
 ) -> None:
     """Train every algorithm on every environment with every seed; may be killed and started again."""
     with needs_agents():
-        from gym_mara.agents.benchmark import Grid, run_grid
+        from gym_mara.agents.benchmark import Grid, open_grid, run_grid
         from gym_mara.agents.figures import plot_grid
 
     grid = Grid(
@@ -70,6 +70,7 @@ def benchmark(
     )
     workers = _jobs(jobs)
     folder = out_folder or Path("runs") / f"benchmark_{preset}"
+    open_grid(folder, grid)
     with interruptible(
         "Interrupted. What has finished is kept, and runs go on from their last checkpoint:\n"
         "give the same command again"
@@ -117,7 +118,13 @@ def search(
         from gym_mara.agents.parallel import run_tasks
 
     workers = _jobs(jobs)
-    wanted = of.Search(task_name(env), algo, whole("--steps", steps), trials, seeds)
+    wanted = of.Search(
+        task_name(env),
+        algo,
+        whole("--steps", steps),
+        whole("--trials", trials),
+        whole("--seeds", seeds),
+    )
     folder = out_folder or Path("runs") / f"search_{algo}_{wanted.env}"
     study = of.open_study(wanted, folder)
 
@@ -143,7 +150,7 @@ def _best(study: Any) -> str:
 
 
 def _jobs(jobs: int | None) -> int:
-    return len(os.sched_getaffinity(0)) if jobs is None else whole_number("--jobs", jobs)
+    return len(cores()) if jobs is None else whole_number("--jobs", jobs)
 
 
 class _GridView:
@@ -177,8 +184,8 @@ class _GridView:
     def table(self) -> Table:
         """A cell for each pair of environment and algorithm: its runs' progress and position errors."""
         total = self._grid.steps * len(self._grid.runs())
-        done = sum(self._steps.values())
-        fresh = done - sum(min(first, self._grid.steps) for first in self._first.values())
+        done = sum(list(self._steps.values()))
+        fresh = done - sum(min(first, self._grid.steps) for first in list(self._first.values()))
         seconds = time.monotonic() - self._began
         left = (total - done) * seconds / fresh if fresh else None
         title = f"{done / total:.0%} of {len(self._grid.runs())} runs, {_clock(seconds)} so far"
