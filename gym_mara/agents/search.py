@@ -37,7 +37,7 @@ SPACES: dict[str, dict[str, tuple[float, float] | list[Any]]] = {
         "n_steps": [8, 16, 32],
         "target_kl": (2e-2, 2e-1),
         "cg_damping": (1e-3, 1e-1),
-        "covariance_rate": (0.3, 3.0),
+        "covariance_rate": (0.1, 3.0),
     },
     "acktr": {
         "n_steps": [1, 2, 4, 8],
