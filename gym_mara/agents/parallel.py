@@ -24,16 +24,13 @@ def run_tasks(
     tasks: Mapping[str, Task],
     jobs: int,
     hear: Callable[[str, Any], None],
-    *,
-    patience: float = 0.5,
 ) -> dict[str, str]:
     """Run tasks, so many at a time, each in a new process.
 
     Args:
         tasks: name → what to do; it pickles, and is given a function by which to say things.
         jobs: how many at a time.
-        hear: called with a task's name and what it said, and every `patience` seconds with ("", None).
-        patience: s.
+        hear: called with a task's name and what it said.
 
     Returns:
         Name → what went wrong, of the tasks that failed; the others go on.
@@ -57,7 +54,7 @@ def run_tasks(
                 process.start()
                 mouth.close()
                 running[ear] = name, process
-            heard = wait(list(running), timeout=patience)
+            heard = wait(list(running))
             for ear in [ear for ear in running if ear in heard]:
                 name, process = running[ear]
                 try:
@@ -72,7 +69,6 @@ def run_tasks(
                     failed[name] = message
                 else:
                     hear(name, message)
-            hear("", None)
     finally:
         for _, process in running.values():
             process.terminate()
