@@ -182,7 +182,9 @@ class KFAC(torch.optim.Optimizer):
                 return moved
             # The divergence grows with the square of a small step.
             scale *= 0.95 * math.sqrt(self.trust_region / moved) if math.isfinite(moved) else 0.1
-        self._place(origin, steps, 0.0)
+        for group, old in zip(self.param_groups, origin, strict=True):
+            for parameter, start in zip(group["params"], old, strict=True):
+                parameter.copy_(start)
         return 0.0
 
     def _place(self, origin: list[list[Tensor]], steps: list[Tensor], scale: float) -> None:
