@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from gym_mara.agents.callbacks import Report
 from gym_mara.agents.evaluate import evaluate_run
 from gym_mara.agents.parallel import Say, run_tasks
@@ -29,6 +31,8 @@ from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import TASKS
 
 _TRAINING = "rollout/reward_per_step"
+PATIENCE = 30.0
+"""How long a run waits for another process that trains it, such as one whose parent was killed, s."""
 NEAR = 10.0
 """A run has learnt to reach once its deterministic policy ends an episode this near, mm."""
 
@@ -148,20 +152,27 @@ def run_grid(
 
 
 def run_one(path: Path, config: RunConfig, say: Say) -> None:
-    """Train one run, or go on with it, and write its result; what is damaged is set aside and begun anew."""
+    """Train one run, or go on with it, and write its result; what is damaged is set aside and begun anew.
+
+    Raises:
+        GymMaraError: another process trains it, and goes on doing so for longer than PATIENCE.
+    """
 
     def report(steps: int, shown: dict[str, float]) -> None:
         say((steps, dict(shown)))
 
+    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=PATIENCE)
     try:
-        run = _trained(path, config, report)
-        result = _result(run)
-    except DamagedRunError as error:
-        aside = _set_aside(path)
-        say(f"{error}; set aside as {aside.name!r} and begun anew")
-        run = train(config, path, report)
-        result = _result(run)
-    write_atomically(path / "result.json", json.dumps(result, indent=2) + "\n")
+        with lock:  # the system frees it when its process is killed
+            try:
+                result = _result(_trained(path, config, report))
+            except DamagedRunError as error:
+                aside = _set_aside(path)
+                say(f"{error}; set aside as {aside.name!r} and begun anew")
+                result = _result(train(config, path, report))
+            write_atomically(path / "result.json", json.dumps(result, indent=2) + "\n")
+    except Timeout:
+        raise GymMaraError(f"another process is training {str(path)!r}; wait for it") from None
 
 
 def _trained(path: Path, config: RunConfig, report: Report) -> RunFolder:

@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
+from gym_mara.agents import benchmark
 from gym_mara.agents.benchmark import Grid, open_grid, read_result, run_grid
 from gym_mara.agents.figures import format_interval, interquartile_mean, plot_grid
 from gym_mara.agents.parallel import Say, run_tasks
@@ -111,6 +113,19 @@ def test_without_room_to_write_runs_fail_and_can_be_gone_on_with(
         assert mine is not None
         assert theirs is not None
         assert mine["last"] == theirs["last"]
+
+
+def test_a_run_that_another_process_trains_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "PATIENCE", 0.1)
+    name, config = next(iter(GRID.runs().items()))
+    with (
+        FileLock(tmp_path / f".{name}.lock"),
+        pytest.raises(GymMaraError, match="another process is training"),
+    ):
+        benchmark.run_one(tmp_path / name, config, print)
+    assert not (tmp_path / name).exists()
 
 
 def test_the_folder_of_another_grid_is_refused(finished_grid: Path, tmp_path: Path) -> None:
