@@ -11,10 +11,15 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.distributions import Distribution, kl_divergence
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.policies import (
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from gym_mara.agents.kfac import KFAC
 from gym_mara.errors import GymMaraError
@@ -29,10 +34,10 @@ class ACKTR(OnPolicyAlgorithm):
     """Actor-critic using Kronecker-factored trust region (Wu et al. 2017, arXiv 1708.05144).
 
     Each rollout makes one update. Actor and critic are networks of their own, each with its own K-FAC optimiser and trust
-    region. The critic predicts a Gaussian, its variance that of the differences between returns and values.
+    region. The critic predicts a Gaussian, its variance the mean square of the differences between returns and values.
 
     Args:
-        policy: "MlpPolicy", or a class of actor and critic made of linear layers.
+        policy: "MlpPolicy", "MultiInputPolicy", or a class of actor and critic made of linear layers.
         env: the environment, or its id.
         learning_rate: η, the longest step along the natural gradient; a number, or a function of the remaining progress.
         n_steps: steps of each environment in a rollout.
@@ -52,7 +57,10 @@ class ACKTR(OnPolicyAlgorithm):
         GymMaraError: the policy has parameters that are neither a linear layer's nor the log standard deviation.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ActorCriticPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+    }
     policy: ActorCriticPolicy
 
     def __init__(
@@ -141,6 +149,20 @@ class ACKTR(OnPolicyAlgorithm):
         self.actor_optimizer = KFAC(actor, exact, trust_region=self.target_kl, **settings)
         self.critic_optimizer = KFAC(critic, trust_region=self.critic_kl, **settings)
 
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "ACKTR",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for so many more steps; as in every algorithm of Stable-Baselines3."""
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
+
     def train(self) -> None:
         """Update actor and critic with the rollout."""
         self.policy.set_training_mode(True)
@@ -152,7 +174,7 @@ class ACKTR(OnPolicyAlgorithm):
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions.long().flatten()
         advantages = rollout.advantages
-        if self.normalize_advantage:
+        if self.normalize_advantage and len(advantages) > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         self._update_actor(rollout.observations, actions, advantages)
         self._update_critic(rollout.observations, rollout.returns)
@@ -179,7 +201,7 @@ class ACKTR(OnPolicyAlgorithm):
 
         def divergence() -> float:
             moved = kl_divergence(distribution, self.policy.get_distribution(observations))
-            return float(moved.reshape(len(observations), -1).sum(dim=1).mean())
+            return float(moved.reshape(len(advantages), -1).sum(dim=1).mean())
 
         self.logger.record("train/kl", optimizer.step(divergence))
         if hasattr(self.policy, "log_std"):
@@ -192,7 +214,8 @@ class ACKTR(OnPolicyAlgorithm):
         with optimizer.watch():
             values = self.policy.predict_values(observations).flatten()
         old = values.detach()
-        variance = (returns - old).var(correction=0) + 1e-8
+        # Around the values, not around the mean difference: an offset is an error as well.
+        variance = (returns - old).square().mean() + 1e-8
         drawn = old + variance.sqrt() * torch.randn_like(old)
         optimizer.observe(0.5 * (drawn - values).square() / variance)
         loss = 0.5 * (returns - values).square() / variance

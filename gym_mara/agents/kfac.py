@@ -21,6 +21,7 @@ from gym_mara.errors import GymMaraError
 # How often a step is shortened until the model has moved no further than the trust region.
 _ATTEMPTS = 10
 _LEAST_DAMPING = 1e-5
+_ADVICE = "look for rewards or observations that are not, or learn more slowly"
 
 
 class KFAC(torch.optim.Optimizer):
@@ -67,6 +68,10 @@ class KFAC(torch.optim.Optimizer):
         self._layers = list(layers)
         self._seen: dict[nn.Module, tuple[Tensor, Tensor]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything, where torch's optimisers would leave out what is not theirs."""
+        return dict(vars(self))
+
     @contextmanager
     def watch(self) -> Iterator[None]:
         """Note what goes into the layers and comes out of them."""
@@ -86,7 +91,12 @@ class KFAC(torch.optim.Optimizer):
 
         Args:
             loss: -log p of an output that the model has drawn, for each example (N,).
+
+        Raises:
+            GymMaraError: a loss is not finite; the factors have not changed then.
         """
+        if not loss.isfinite().all():
+            raise GymMaraError(f"the model's predictions are not finite: {_ADVICE}")
         outputs = [self._seen[layer][1] for layer in self._layers]
         gradients = torch.autograd.grad(loss.sum(), outputs, retain_graph=True)
         for layer, group, g in zip(self._layers, self.param_groups, gradients, strict=False):
@@ -117,9 +127,7 @@ class KFAC(torch.optim.Optimizer):
         """
         gradients = [self._gradient(group) for group in self.param_groups]
         if not all(gradient.isfinite().all() for gradient in gradients):
-            raise GymMaraError(
-                "the gradient is not finite: look for rewards or observations that are not, or learn more slowly"
-            )
+            raise GymMaraError(f"the gradient is not finite: {_ADVICE}")
         if self.param_groups[0]["updates"] < self.cold_updates:
             norm = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
             shrink = min(1.0, self.max_grad_norm / (norm + 1e-8))
@@ -173,19 +181,26 @@ class KFAC(torch.optim.Optimizer):
         origin = [[p.clone() for p in group["params"]] for group in self.param_groups]
         expected = self.divergence(steps)
         scale = math.sqrt(self.trust_region / max(expected, self.trust_region))
-        for _ in range(_ATTEMPTS):
-            self._place(origin, steps, scale)
-            if closure is None:
-                return scale**2 * expected
-            moved = closure()
-            if moved <= self.trust_region:
-                return moved
-            # The divergence grows with the square of a small step.
-            scale *= 0.95 * math.sqrt(self.trust_region / moved) if math.isfinite(moved) else 0.1
+        try:
+            for _ in range(_ATTEMPTS):
+                self._place(origin, steps, scale)
+                if closure is None:
+                    return scale**2 * expected
+                moved = closure()
+                if moved <= self.trust_region:
+                    return moved
+                # The divergence grows with the square of a small step.
+                scale *= 0.95 * math.sqrt(self.trust_region / moved) if moved < math.inf else 0.1
+        except BaseException:
+            self._put_back(origin)
+            raise
+        self._put_back(origin)
+        return 0.0
+
+    def _put_back(self, origin: list[list[Tensor]]) -> None:
         for group, old in zip(self.param_groups, origin, strict=True):
             for parameter, start in zip(group["params"], old, strict=True):
                 parameter.copy_(start)
-        return 0.0
 
     def _place(self, origin: list[list[Tensor]], steps: list[Tensor], scale: float) -> None:
         for group, old, step in zip(self.param_groups, origin, steps, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 
@@ -185,6 +186,56 @@ def test_a_gradient_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
     with pytest.raises(GymMaraError, match="not finite"):
         kfac.step()
     assert not log_std.any()
+
+
+def test_predictions_that_are_not_finite_leave_the_factors_as_they_were() -> None:
+    net = network(2, 1)
+    kfac = KFAC(linear_layers(net))
+    x = torch.ones(10, 2)
+    observe(kfac, net, x, torch.zeros(10, 1))
+    x[0, 0] = math.nan
+    with pytest.raises(GymMaraError, match="not finite"):
+        observe(kfac, net, x, torch.zeros(10, 1))
+    assert all(f.isfinite().all() for f in kfac.state[linear_layers(net)[0].weight].values())
+
+
+@pytest.mark.parametrize("moved", [math.nan, math.inf, 1.0])
+def test_a_step_that_never_comes_within_the_trust_region_is_not_made(moved: float) -> None:
+    log_std = nn.Parameter(torch.tensor([0.1, 0.2]))
+    before = log_std.detach().clone()
+    kfac = KFAC([], [(log_std, 2.0)], trust_region=1e-3)
+    log_std.grad = torch.ones(2)
+    assert kfac.step(lambda: moved) == 0.0
+    assert torch.equal(log_std, before)
+
+
+def test_an_error_in_the_middle_of_a_step_undoes_it() -> None:
+    log_std = nn.Parameter(torch.tensor([0.1, 0.2]))
+    before = log_std.detach().clone()
+    kfac = KFAC([], [(log_std, 2.0)])
+    log_std.grad = torch.ones(2)
+
+    def interrupted() -> float:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        kfac.step(interrupted)
+    assert torch.equal(log_std, before)
+
+
+def test_a_copy_goes_on_as_the_original() -> None:
+    net = network(2, 1)
+    kfac = KFAC(linear_layers(net), damping=0.3, trust_region=0.02)
+    net_copy, kfac_copy = copy.deepcopy((net, kfac))
+    ends = []
+    for each, optimizer in ((net, kfac), (net_copy, kfac_copy)):
+        for _ in range(12):
+            observe(optimizer, each, torch.ones(10, 2), torch.zeros(10, 1))
+            each.zero_grad()
+            each(torch.ones(10, 2)).square().mean().backward()
+            optimizer.step()
+        ends.append(torch.cat([p.detach().flatten() for p in each.parameters()]))
+    assert torch.equal(*ends)
 
 
 def test_factors_are_running_averages() -> None:
