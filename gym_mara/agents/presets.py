@@ -27,22 +27,25 @@ class Preset:
 
 
 # Where joints are at their targets at once, what comes next hangs on the action alone, hence no discounted future (γ = 0).
-# Many arms, short rollouts, a narrow start, and a learning rate that begins high: once the tool is in place, the angle is
-# found by walking along a narrow curved valley, a fraction of the policy's standard deviation at each update.
+# Many arms and short rollouts: once the tool is in place, the angle is found by walking along a narrow curved valley, a
+# part of the policy's standard deviation at each update, so that many updates matter more than good ones.
 _PPO_TELEPORTING = Preset(
     num_envs=256,
     policy="natural",
     arguments={
-        "n_steps": 8,
-        "batch_size": 1024,
-        "n_epochs": 10,
+        "n_steps": 2,
+        "batch_size": 256,
+        "n_epochs": 2,
         "gamma": 0.0,
-        "learning_rate": ((0.0, 1.5e-2), (1.0, 0.0)),
+        "learning_rate": ((0.0, 0.06), (0.7, 0.06), (1.0, 0.0)),
         "clip_range": 0.2,
+        "vf_coef": 0.1,
+        "max_grad_norm": 10.0,
         "policy_kwargs": {
             "net_arch": [64, 64],
-            "log_std_init": -1.5,
-            "covariance_rate": 0.5,
+            "log_std_init": -2.0,
+            "covariance_rate": 1.3,
+            "widening": 0.1,
         },
     },
 )
@@ -62,21 +65,25 @@ _PPO_TRAVELLING = Preset(
     },
 )
 
+# Damping and bias_rate keep the natural gradient from following what few states differ in.
 _TRPO_TELEPORTING = Preset(
     num_envs=256,
     policy="natural",
     arguments={
-        "n_steps": 8,
-        "batch_size": 1024,
+        "n_steps": 2,
+        "batch_size": 512,
         "gamma": 0.0,
-        "learning_rate": 1e-3,
-        "target_kl": 0.06,
-        "cg_damping": 0.1,
-        "n_critic_updates": 5,
+        "learning_rate": 5e-3,
+        "target_kl": 0.1,
+        "cg_max_steps": 5,
+        "cg_damping": 10.0,
+        "n_critic_updates": 2,
         "policy_kwargs": {
             "net_arch": [64, 64],
-            "log_std_init": -1.5,
-            "covariance_rate": 0.15,
+            "log_std_init": -2.0,
+            "covariance_rate": 1.2,
+            "bias_rate": 10.0,
+            "widening": 0.1,
         },
     },
 )

@@ -85,7 +85,15 @@ def test_samples_have_its_mean_and_covariance(distribution: NaturalGaussian) -> 
 @pytest.fixture
 def model() -> PPO:
     env = make_env("MARAOrient-v0", "pinocchio", 16, {})
-    ppo = PPO(NaturalGaussianPolicy, env, n_steps=16, batch_size=64, seed=0, device="cpu")
+    ppo = PPO(
+        NaturalGaussianPolicy,
+        env,
+        n_steps=16,
+        batch_size=64,
+        policy_kwargs={"bias_rate": 3.0},
+        seed=0,
+        device="cpu",
+    )
     return ppo.learn(16 * 16 * 3)
 
 
@@ -121,6 +129,24 @@ def test_the_policy_never_narrows_below_what_float32_resolves(model: PPO) -> Non
     policy.set_training_mode(True)
     sizes = torch.linalg.svdvals(policy.factor)
     torch.testing.assert_close(sizes, torch.full((6,), LEAST_STD))
+
+
+def test_what_the_reward_says_nothing_of_stays_wide() -> None:
+    env = make_env("MARAOrient-v0", "pinocchio", 4, {})
+    kwargs = {"widening": 0.1, "log_std_init": -2.0}
+    ppo = PPO(NaturalGaussianPolicy, env, n_steps=4, batch_size=16, policy_kwargs=kwargs)
+    policy = ppo.policy
+    assert isinstance(policy, NaturalGaussianPolicy)
+    before = torch.linalg.svdvals(policy.factor)
+    policy(torch.as_tensor(ppo.env.reset()))  # type: ignore[union-attr]
+    policy.set_training_mode(True)
+    torch.testing.assert_close(torch.linalg.svdvals(policy.factor), before)  # nothing was learnt
+    with torch.no_grad():
+        policy.log_scale[0, 0] = -0.5
+    policy(torch.as_tensor(ppo.env.reset()))  # type: ignore[union-attr]
+    policy.set_training_mode(True)
+    changes = torch.log(torch.linalg.svdvals(policy.factor) / before)
+    torch.testing.assert_close(changes, torch.tensor([0.05] * 5 + [-0.45]), atol=1e-3, rtol=0.0)
 
 
 def test_it_comes_back_from_disk(model: PPO, tmp_path: Path) -> None:
