@@ -91,7 +91,7 @@ def open_grid(folder: Path, grid: Grid) -> None:
     grid.check()
     file = folder / "grid.json"
     if file.is_file():
-        there = read_grid(folder)
+        there, its_presets = _read(folder)
         differences = [
             f"{name} {before!r} there, {now!r} now"
             for (name, before), now in zip(
@@ -99,6 +99,8 @@ def open_grid(folder: Path, grid: Grid) -> None:
             )
             if before != now
         ]
+        if not differences and its_presets != _presets(grid):
+            differences = [f"made with other {grid.preset_name!r} presets than there are now"]
         if differences:
             raise GymMaraError(
                 f"{str(folder)!r} holds another grid ({'; '.join(differences)}): choose another --out"
@@ -110,7 +112,8 @@ def open_grid(folder: Path, grid: Grid) -> None:
         raise GymMaraError(f"{str(folder)!r} is neither empty nor a grid: choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(asdict(grid), indent=2) + "\n")
+        values = {**asdict(grid), "presets": _presets(grid)}
+        write_atomically(file, json.dumps(values, indent=2) + "\n")
     except OSError as error:
         raise GymMaraError(f"cannot write to {str(folder)!r}: {error}") from error
 
@@ -121,10 +124,22 @@ def read_grid(folder: Path) -> Grid:
     Raises:
         GymMaraError: there is none, or it is damaged.
     """
+    return _read(folder)[0]
+
+
+def _presets(grid: Grid) -> Any:
+    """A grid's presets as they are now, in the form in which a file has them."""
+    presets = {algo: [asdict(p) for p in PRESETS[grid.preset_name][algo]] for algo in grid.algos}
+    return json.loads(json.dumps(presets))
+
+
+def _read(folder: Path) -> tuple[Grid, Any]:
+    """A grid, and the presets that it was begun with."""
     try:
         values = json.loads((folder / "grid.json").read_text())
         values |= {name: tuple(values[name]) for name in ("envs", "algos")}
-        return Grid(**values)
+        presets = values.pop("presets")
+        return Grid(**values), presets
     except FileNotFoundError:
         raise GymMaraError(f"{str(folder)!r} is no grid: it has no grid.json") from None
     except (ValueError, TypeError, KeyError, OSError) as error:

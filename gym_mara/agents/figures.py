@@ -17,7 +17,7 @@ from scipy.stats import bootstrap, trim_mean
 
 from gym_mara.agents.benchmark import Grid, read_grid, read_result
 from gym_mara.agents.evaluate import MAX_EPISODE_STEPS
-from gym_mara.agents.run import RunFolder, read_progress
+from gym_mara.agents.run import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import TASKS
 
@@ -78,17 +78,37 @@ def plot_grid(folder: Path) -> list[Path]:
     }
     if not results:
         raise GymMaraError(f"no run of the grid {str(folder)!r} has finished")
-    curves = {name: read_progress(RunFolder.open(folder / name).progress_file) for name in results}
+    curves = {name: _curve(folder / name) for name in results}
     files = []
     for env in grid.envs:
-        files.append(_draw(folder / f"{env}.png", grid, env, grid.algos, curves))
-        if "acktr" in grid.algos:
+        finished = {grid.runs()[name].algo for name in results if grid.runs()[name].env == env}
+        if finished:
+            files.append(_draw(folder / f"{env}.png", grid, env, grid.algos, curves))
+        if "acktr" in finished:
             files.append(_draw(folder / f"{env}_acktr.png", grid, env, ("acktr",), curves))
     files.append(_write_curves(folder / "curves.csv", grid, curves))
     rows = list(_rows(grid, results))
     files.append(_write_table(folder / "table.csv", rows))
     (folder / "table.md").write_text(_markdown(rows))
     return [*files, folder / "table.md"]
+
+
+def _curve(path: Path) -> list[dict[str, float]]:
+    """A finished run's table of progress.
+
+    Raises:
+        DamagedRunError: it is gone or damaged, and how to have it trained again.
+    """
+    try:
+        rows = read_progress(path / "progress.csv")
+        if any(_TRAINING in row for row in rows):
+            return rows
+        raise DamagedRunError("it holds no curve")
+    except (OSError, DamagedRunError) as error:
+        raise DamagedRunError(
+            f"the finished run {str(path)!r} is damaged: progress.csv: {error}; "
+            "move the folder away and give the benchmark's command again to train it anew"
+        ) from error
 
 
 def _draw(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -51,7 +52,8 @@ def run_tasks(
                 name, task = waiting.pop(0)
                 mouth, ear = _SPAWN.Pipe(duplex=False)[::-1]
                 process = _SPAWN.Process(target=_work, args=(task, mouth), name=name)
-                process.start()
+                with _interrupts_later():
+                    process.start()
                 mouth.close()
                 running[ear] = name, process
             heard = wait(list(running))
@@ -77,8 +79,21 @@ def run_tasks(
     return failed
 
 
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Hold interrupts back, here for a moment, in a process that begins meanwhile until it lets them in."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _work(task: Task, mouth: Connection) -> None:
-    """In the process: do the task; what the user can mend is told in a line."""
+    """In the process: do the task; what the user can mend is told in a line, all else with where it arose."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
 
     def say(message: Any) -> None:
@@ -89,6 +104,7 @@ def _work(task: Task, mouth: Connection) -> None:
 
     try:
         task(say)
-    except (GymMaraError, OSError) as error:
+    except Exception as error:
+        known = isinstance(error, (GymMaraError, OSError))
         with suppress(OSError):
-            mouth.send(("failed", str(error)))
+            mouth.send(("failed", str(error) if known else traceback.format_exc().rstrip()))

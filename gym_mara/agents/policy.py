@@ -7,6 +7,7 @@ import json
 import pickle
 import shutil
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,8 +28,19 @@ from gym_mara.agents.run import DamagedRunError, RunConfig, replace_folder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.errors import GymMaraError, unknown
 
-# What reading a pickle or a zip that was cut short or overwritten raises.
-DAMAGE = (OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile, pickle.UnpicklingError)
+# What reading a pickle or a zip that was cut short or overwritten raises; others than ValueError, which tells of a misfit.
+DAMAGE = (
+    OSError,
+    EOFError,
+    LookupError,
+    AttributeError,
+    TypeError,
+    ImportError,
+    UnicodeDecodeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    pickle.UnpicklingError,
+)
 
 ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO, "trpo": TRPO, "acktr": ACKTR}
 POLICY_CLASSES: dict[str, type[ActorCriticPolicy]] = {

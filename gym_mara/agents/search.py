@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,33 +12,38 @@ from typing import Any
 
 import numpy as np
 import optuna
+from filelock import FileLock, Timeout
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from gym_mara.agents import presets
 from gym_mara.agents.evaluate import evaluate_run
-from gym_mara.agents.parallel import Say
+from gym_mara.agents.parallel import Say, run_tasks
 from gym_mara.agents.run import RunConfig
 from gym_mara.agents.train import train
 from gym_mara.errors import GymMaraError, unknown
 
+_State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
 """Trials train on seeds from here on; results are reported of seeds from 0 on."""
 
 # Algorithm → hyperparameter → (lowest, highest), on a logarithmic scale, or a list of what it can be.
 SPACES: dict[str, dict[str, tuple[float, float] | list[Any]]] = {
     "ppo": {
-        "n_steps": [4, 8, 16],
-        "batch_size": [512, 1024],
-        "n_epochs": [5, 10],
-        "learning_rate": (2e-3, 2e-2),
-        "covariance_rate": (0.3, 5.0),
+        "n_steps": [1, 2, 4, 8],
+        "batch_size": [256, 512],
+        "n_epochs": [1, 2, 4],
+        "learning_rate": (1e-2, 2e-1),
+        "covariance_rate": (0.5, 3.0),
+        "widening": (0.02, 0.2),
     },
     "trpo": {
-        "n_steps": [8, 16, 32],
+        "n_steps": [1, 2, 4, 8],
         "target_kl": (2e-2, 2e-1),
-        "cg_damping": (1e-3, 1e-1),
-        "covariance_rate": (0.1, 3.0),
+        "cg_damping": (1.0, 100.0),
+        "covariance_rate": (0.3, 3.0),
+        "bias_rate": [1.0, 3.0, 10.0, 30.0],
+        "widening": (0.02, 0.2),
     },
     "acktr": {
         "n_steps": [1, 2, 4, 8],
@@ -52,7 +58,7 @@ SPACES: dict[str, dict[str, tuple[float, float] | list[Any]]] = {
 }
 
 
-_OF_POLICY = ("log_std_init", "covariance_rate")
+_OF_POLICY = ("log_std_init", "covariance_rate", "bias_rate", "widening")
 
 
 @dataclass(frozen=True)
@@ -85,13 +91,42 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         load_if_exists=True,
     )
     about = {name: value for name, value in asdict(search).items() if name != "trials"}
-    if not study.user_attrs:
+    there = study.user_attrs.get("search")
+    if there is None:
         study.enqueue_trial(values_of(search.algo))
-    elif study.user_attrs != about:
-        raise GymMaraError(f"{str(folder)!r} holds another search: {study.user_attrs}")
-    for name, value in about.items():
-        study.set_user_attr(name, value)
+        study.set_user_attr("search", about)
+    elif there != about:
+        raise GymMaraError(f"{str(folder)!r} holds another search: {there}")
     return study
+
+
+def run_search(
+    search: Search, folder: Path, jobs: int, hear: Callable[[str, Any], None]
+) -> dict[str, str]:
+    """Search with so many processes; trials that a kill cut off before are tried again.
+
+    Args:
+        search: what for.
+        folder: of the search.
+        jobs: how many processes.
+        hear: called with a process's name and how many trials have ended, or None as a trial goes on.
+
+    Returns:
+        Process → what went wrong, of those that failed.
+
+    Raises:
+        GymMaraError: the folder holds another search, or another process searches there.
+    """
+    study = open_study(search, folder)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            for trial in study.get_trials(deepcopy=False, states=(_State.RUNNING,)):
+                study.tell(trial.number, state=_State.FAIL)
+                study.enqueue_trial({**trial.system_attrs.get("fixed_params", {}), **trial.params})
+            tasks = {f"worker {i}": partial(work, search, folder) for i in range(jobs)}
+            return run_tasks(tasks, jobs, hear)
+    except Timeout:
+        raise GymMaraError(f"another process is searching in {str(folder)!r}") from None
 
 
 def work(search: Search, folder: Path, say: Say) -> None:
@@ -104,9 +139,14 @@ def work(search: Search, folder: Path, say: Say) -> None:
 
 
 def finished(study: optuna.Study) -> int:
-    """How many trials have ended, those that were given up early among them."""
-    states = optuna.trial.TrialState
-    return len(study.get_trials(deepcopy=False, states=(states.COMPLETE, states.PRUNED)))
+    """How many trials have ended, those that were given up early or diverged among them, but not those that a kill ended."""
+    return len(study.get_trials(deepcopy=False, states=(_State.COMPLETE, _State.PRUNED)))
+
+
+def best(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
+    """The best trial that went to its end, if there is one."""
+    done = study.get_trials(deepcopy=False, states=(_State.COMPLETE,))
+    return min(done, key=lambda trial: trial.value or 0.0, default=None)
 
 
 def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
@@ -140,7 +180,10 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
             checkpoint_every=search.steps // 10,
         )
         with TemporaryDirectory() as folder:
-            run = train(config, Path(folder) / "run", report, preset=preset)
+            try:
+                run = train(config, Path(folder) / "run", report, preset=preset)
+            except GymMaraError as error:  # it diverged
+                raise optuna.TrialPruned(str(error)) from error
             reward = float(evaluate_run(run, episodes=1)["reward_per_step"].mean())
         values.append(_shortfall(reward))
     return float(np.mean(values))

@@ -30,7 +30,7 @@ from gym_mara.agents.callbacks import (
 )
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import DAMAGE, POLICY_CLASSES, algorithm_class, load_model
+from gym_mara.agents.policy import POLICY_CLASSES, algorithm_class, load_model
 from gym_mara.agents.run import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError
 
@@ -90,11 +90,12 @@ def resume(path: Path, report: Report) -> RunFolder:
         env.restore_state(state["env"])
         wrapped.returns = state["returns"]
         restore_random_state(state["random"])
-    except DAMAGE as error:
+        best, elapsed = float(state["best"]), float(state["elapsed"])
+    except Exception as error:  # a damaged pickle raises anything
         raise DamagedRunError(
             f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
         ) from error
-    return _learn(run, model, report=report, best=state["best"], elapsed=state["elapsed"])
+    return _learn(run, model, report=report, best=best, elapsed=elapsed)
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:

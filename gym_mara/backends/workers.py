@@ -30,6 +30,8 @@ class WorkerDiedError(GymMaraError):
 def choose_workers(num_envs: int, workers: int | None) -> int:
     """How many processes N arms are spread over: those that were asked for, or as many as there are cores.
 
+    In a process that multiprocessing has begun it is one: its parent shares out the cores.
+
     Raises:
         GymMaraError: the arms cannot be shared out equally.
     """
@@ -41,8 +43,8 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
                 f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
             )
         return workers
-    if multiprocessing.current_process().daemon:
-        return 1  # a worker itself: it may have none of its own
+    if multiprocessing.parent_process() is not None:
+        return 1
     return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)
 
 

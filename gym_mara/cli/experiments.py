@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,7 +114,6 @@ def search(
     """Search an algorithm's hyperparameters with Optuna, on seeds that no result is reported of."""
     with needs_agents():
         from gym_mara.agents import search as of
-        from gym_mara.agents.parallel import run_tasks
 
     workers = _jobs(jobs)
     wanted = of.Search(
@@ -128,25 +126,20 @@ def search(
     folder = out_folder or Path("runs") / f"search_{algo}_{wanted.env}"
     study = of.open_study(wanted, folder)
 
+    def show_best() -> None:
+        best = of.best(study)
+        told = f"best: {best.value:.3f} {json.dumps(best.params)}" if best else "none finished yet"
+        out.print(f"{of.finished(study)} of {trials} trials, {told}", soft_wrap=True)
+
     def hear(name: str, message: Any) -> None:
         if message is not None:
-            out.print(f"{message} of {trials} trials", _best(study), soft_wrap=True)
+            show_best()
 
     with interruptible("Interrupted. Trials that have ended are kept: give the same command again"):
-        tasks = {f"worker {i}": partial(of.work, wanted, folder) for i in range(workers)}
-        failed = run_tasks(tasks, workers, hear)
+        failed = of.run_search(wanted, folder, workers, hear)
     if failed:
         raise GymMaraError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
-    out.print(_best(study), soft_wrap=True)
-
-
-def _best(study: Any) -> str:
-    """The best trial so far, as text."""
-    done = [trial for trial in study.trials if trial.value is not None]
-    if not done:
-        return "none finished yet"
-    best = min(done, key=lambda trial: trial.value)
-    return f"best: {best.value:.3f} {json.dumps(best.params)}"
+    show_best()
 
 
 def _jobs(jobs: int | None) -> int:

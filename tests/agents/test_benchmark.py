@@ -24,6 +24,8 @@ from gym_mara.agents import benchmark
 from gym_mara.agents.benchmark import Grid, open_grid, read_result, run_grid
 from gym_mara.agents.figures import format_interval, interquartile_mean, plot_grid
 from gym_mara.agents.parallel import Say, run_tasks
+from gym_mara.agents.presets import PRESETS
+from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
 
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
@@ -128,9 +130,15 @@ def test_a_run_that_another_process_trains_is_left_to_it(
     assert not (tmp_path / name).exists()
 
 
-def test_the_folder_of_another_grid_is_refused(finished_grid: Path, tmp_path: Path) -> None:
+def test_the_folder_of_another_grid_is_refused(
+    finished_grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(GymMaraError, match=r"another grid .*steps 4096 there, 8192 now"):
         open_grid(finished_grid, replace(GRID, steps=8192))
+    changed = {"ppo": PRESETS["paper"]["ppo"], "acktr": PRESETS["tuned"]["acktr"]}
+    monkeypatch.setitem(PRESETS, "tuned", changed)
+    with pytest.raises(GymMaraError, match="made with other 'tuned' presets"):
+        open_grid(finished_grid, GRID)
     (tmp_path / "something").touch()
     with pytest.raises(GymMaraError, match="neither empty nor a grid"):
         open_grid(tmp_path, GRID)
@@ -171,6 +179,24 @@ def test_figures_and_tables_show_every_run(finished_grid: Path) -> None:
     assert "| MARA-v0 | ACKTR | 1 |" in text
 
 
+def test_a_finished_run_that_is_damaged_later_is_named(finished_grid: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "grid"
+    shutil.copytree(finished_grid, folder)
+    (folder / "MARA-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
+    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it anew"):
+        plot_grid(folder)
+
+
+def test_what_has_not_finished_is_left_out_of_the_figures(
+    finished_grid: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "grid"
+    shutil.copytree(finished_grid, folder)
+    (folder / "MARA-v0_acktr_0" / "result.json").unlink()
+    files = {file.name for file in plot_grid(folder)}
+    assert files == {"MARA-v0.png", "curves.csv", "table.csv", "table.md"}
+
+
 def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:
     with pytest.raises(GymMaraError, match=r"no grid\.json"):
         plot_grid(tmp_path)
@@ -201,11 +227,26 @@ def _errs(say: Say) -> None:
     raise OSError(28, "No space left on device")
 
 
+def _blunders(say: Say) -> None:
+    raise ZeroDivisionError("in the task")
+
+
+def _counts_workers(say: Say) -> None:
+    say(choose_workers(12, None))
+
+
+def test_a_task_has_its_core_and_no_more() -> None:
+    heard: list[Any] = []
+    run_tasks({"one": _counts_workers}, 1, lambda name, message: heard.append(message))
+    assert heard == [1]
+
+
 def test_a_task_whose_process_dies_does_not_stop_the_others() -> None:
     heard: list[tuple[str, Any]] = []
-    tasks = {"dying": _dies, "full": _errs, "well": _speaks}
+    tasks = {"dying": _dies, "full": _errs, "blundering": _blunders, "well": _speaks}
     failed = run_tasks(tasks, 1, lambda name, message: heard.append((name, message)))
-    assert failed.keys() == {"dying", "full"}
+    assert failed.keys() == {"dying", "full", "blundering"}
+    assert "_blunders" in failed["blundering"], "where it arose"
     assert "ended with -9" in failed["dying"]
     assert "No space left" in failed["full"]
     assert ("well", "hello") in heard

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
 from gym_mara.agents import presets
 from gym_mara.agents import search as module
 from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.parallel import run_tasks
 from gym_mara.agents.policy import algorithm_class
 from gym_mara.agents.search import (
     FIRST_SEED,
     SPACES,
     Search,
+    best,
     finished,
     open_study,
+    run_search,
+    values_of,
     with_values,
     work,
 )
@@ -52,9 +54,43 @@ def test_a_search_goes_on_where_it_was_cut_off(
     assert min(seeds) >= FIRST_SEED
 
 
+def test_a_trial_that_was_killed_is_tried_again(tmp_path: Path) -> None:
+    study = open_study(SMALL, tmp_path)
+    first = values_of("acktr")
+    study.ask()  # and never told
+    killed = study.ask()
+    killed.suggest_float("learning_rate", *SPACES["acktr"]["learning_rate"], log=True)
+    assert run_search(SMALL, tmp_path, 1, deaf) == {}
+    trials = open_study(SMALL, tmp_path).get_trials()
+    assert not any(trial.state.name == "RUNNING" for trial in trials)
+    assert finished(study) == 2
+    ended = [trial.params for trial in trials if trial.state.name == "COMPLETE"]
+    assert ended[0] == first
+    assert ended[1]["learning_rate"] == killed.params["learning_rate"]
+
+
+def test_a_trial_that_diverges_does_not_end_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*arguments: Any, **keywords: Any) -> None:
+        raise GymMaraError("the gradient is not finite")
+
+    monkeypatch.setattr(module, "train", diverge)
+    work(SMALL, tmp_path, deaf)
+    study = open_study(SMALL, tmp_path)
+    assert finished(study) == 2
+    assert best(study) is None
+
+
+def test_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    with FileLock(tmp_path / ".lock"), pytest.raises(GymMaraError, match="another process"):
+        run_search(SMALL, tmp_path, 1, deaf)
+
+
 def test_several_processes_may_search(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
-    assert run_tasks({n: partial(work, SMALL, tmp_path) for n in "ab"}, 2, deaf) == {}
+    assert run_search(SMALL, tmp_path, 2, deaf) == {}
     assert finished(open_study(SMALL, tmp_path)) >= 2
 
 
