@@ -60,6 +60,14 @@ def algorithm_class(name: str) -> type[OnPolicyAlgorithm]:
     return ALGORITHMS[name]
 
 
+def policy_arguments(preset: Preset) -> dict[str, Any]:
+    """Keyword arguments of a preset's policy."""
+    arguments = dict(preset.arguments.get("policy_kwargs", {}))
+    if "optimizer_class" in arguments:
+        arguments["optimizer_class"] = getattr(torch.optim, arguments["optimizer_class"])
+    return arguments
+
+
 def save_policy(
     folder: Path, model: OnPolicyAlgorithm, extra: dict[str, bytes] | None = None
 ) -> None:
@@ -87,8 +95,8 @@ def load_policy(
         GymMaraError: the policy is one of another environment.
     """
     preset = Preset(**config.preset)
-    arguments = preset.arguments.get("policy_kwargs", {})
     make = POLICY_CLASSES[preset.policy]
+    arguments = policy_arguments(preset)
     policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
     with _told(folder):
         with zipfile.ZipFile(folder / "model.zip") as archive, archive.open("policy.pth") as file:

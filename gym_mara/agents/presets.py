@@ -1,7 +1,8 @@
 """Hyperparameters, apart from the code that uses them.
 
 A preset says how many arms an agent trains on, what is normalised, and the arguments of the algorithm. A value that
-changes over the run is written as points (progress, value), the progress from 0 to 1, with straight lines between them.
+changes over the run is written as points (progress, value), the progress from 0 to 1, with straight lines between them;
+an optimiser by its name in torch.optim.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ _PPO_TELEPORTING = Preset(
         },
     },
 )
-# Where they travel, an action pays off some tenths of a second later; few arms, so that each sees many episodes.
+# Where they travel, an action pays off some tenths of a second later; few arms, so that each sees many episodes. The
+# critic's errors are as large as the returns, which plain gradient descent does not bear.
 _PPO_TRAVELLING = Preset(
     num_envs=16,
     policy="natural",
@@ -61,7 +63,11 @@ _PPO_TRAVELLING = Preset(
         "gae_lambda": 0.95,
         "learning_rate": ((0.0, 2e-3), (1.0, 0.0)),
         "clip_range": 0.2,
-        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
+        "policy_kwargs": {
+            "net_arch": [64, 64],
+            "log_std_init": -1.5,
+            "optimizer_class": "Adam",
+        },
     },
 )
 
@@ -98,7 +104,11 @@ _TRPO_TRAVELLING = Preset(
         "learning_rate": 1e-3,
         "target_kl": 0.02,
         "cg_damping": 0.01,
-        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
+        "policy_kwargs": {
+            "net_arch": [64, 64],
+            "log_std_init": -1.5,
+            "optimizer_class": "Adam",
+        },
     },
 )
 _ACKTR_TELEPORTING = Preset(

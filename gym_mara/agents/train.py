@@ -30,7 +30,7 @@ from gym_mara.agents.callbacks import (
 )
 from gym_mara.agents.evaluate import make_env
 from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import POLICY_CLASSES, algorithm_class, load_model
+from gym_mara.agents.policy import POLICY_CLASSES, algorithm_class, load_model, policy_arguments
 from gym_mara.agents.run import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError
 
@@ -112,6 +112,7 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
+    arguments["policy_kwargs"] = policy_arguments(preset)
     policy = POLICY_CLASSES[preset.policy]
     return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
 

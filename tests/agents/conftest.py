@@ -9,7 +9,7 @@ import pytest
 from gym_mara.agents.run import RunConfig, RunFolder
 from gym_mara.agents.train import train, use_one_thread
 
-ROLLOUT = 256 * 8
+ROLLOUT = 256 * 2
 """Steps between two updates of the preset."""
 
 
