@@ -80,7 +80,7 @@ _TRPO_TELEPORTING = Preset(
         "batch_size": 512,
         "gamma": 0.0,
         "learning_rate": 5e-3,
-        "target_kl": 0.1,
+        "target_kl": 0.15,
         "cg_max_steps": 5,
         "cg_damping": 10.0,
         "n_critic_updates": 2,
@@ -112,9 +112,9 @@ _TRPO_TRAVELLING = Preset(
     },
 )
 _ACKTR_TELEPORTING = Preset(
-    num_envs=256,
+    num_envs=64,
     arguments={
-        "n_steps": 1,
+        "n_steps": 4,
         "gamma": 0.0,
         "learning_rate": ((0.0, 0.08), (1.0, 0.0)),
         "target_kl": 0.01,
