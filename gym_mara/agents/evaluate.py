@@ -59,16 +59,20 @@ def evaluate_run(
     """
     if episodes < 1:
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
-    config, options = run.config, run.config.env_options
-    if backend not in (None, config.backend):
-        options = options_beyond_backend(config)
-    env = make_env(config.env, backend or config.backend, episodes, options)
+    config = run.config
+    backend = backend or config.backend
+    env = make_env(config.env, backend, episodes, options_on(backend, config))
     try:
         policy, wrapped = load_policy(run.policy(which), config, env)
         env.seed(config.seed)
         return play(policy, wrapped)
     finally:
         env.close()
+
+
+def options_on(backend: str, config: RunConfig) -> dict[str, Any]:
+    """The keyword arguments of a run's environment, on another backend those that mean something there."""
+    return config.env_options if backend == config.backend else options_beyond_backend(config)
 
 
 def options_beyond_backend(config: RunConfig) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.agents.evaluate import MAX_EPISODE_STEPS, make_env, options_beyond_backend
-from gym_mara.agents.policy import load_policy
+from gym_mara.agents.evaluate import options_beyond_backend
+from gym_mara.agents.rollout import Player, record
 from gym_mara.agents.run import RunFolder
 from gym_mara.backends import backend_names, backend_settings
 from gym_mara.errors import GymMaraError
@@ -76,44 +76,22 @@ def transfer(
 def _play(
     run: RunFolder, title: str, backend: str, options: dict[str, Any], episodes: int, which: str
 ) -> Transferred:
-    env = make_env(run.config.env, backend, episodes, options, max_episode_steps=None)
-    try:
-        policy, normalisation = load_policy(run.policy(which), run.config, env)
-        simulation = env.env.simulation
-        observation, _ = env.env.reset(seed=run.config.seed)
-        history: dict[str, list[NDArray[np.float64]]] = {}
-        for _ in range(MAX_EPISODE_STEPS):
-            seen: Any = normalisation.normalize_obs(observation)
-            action, _ = policy.predict(seen, deterministic=True)
-            observation, reward, _, _, info = env.env.step(env.targets(action))
-            torque = info.get("joint_torque", np.full((episodes, 1), np.nan))
-            step = {
-                "error": info.get("position_error", np.full(episodes, np.nan)),
-                "angle": info.get("angle_error", np.full(episodes, np.nan)),
-                "reward": reward,
-                "collided": info["collided"],
-                "torque": np.abs(torque / simulation.robot.effort_limit).max(axis=1),
-                "speed": np.abs(simulation.backend.state.qd).max(axis=1),
-            }
-            for name, values in step.items():
-                history.setdefault(name, []).append(values)
-        period = simulation.backend.control_period
-    finally:
-        env.close()
-    of = {name: np.array(values, dtype=np.float64) for name, values in history.items()}
+    with Player(run, backend, options, which=which, episodes=episodes) as player:
+        played = record(player)
+        effort_limit = player.env.simulation.robot.effort_limit
     return Transferred(
         backend=title,
-        position_error_mm=1000.0 * of["error"][-1],
-        angle_deg=np.degrees(of["angle"][-1]),
-        return_=of["reward"].sum(axis=0),
-        collisions=of["collided"].sum(axis=0),
-        settling_time_s=period * _settled_after(of["error"]),
-        highest_torque=of["torque"].max(axis=0),
-        highest_velocity=of["speed"].max(axis=0),
+        position_error_mm=1000.0 * played.position_error[-1],
+        angle_deg=np.degrees(played.angle_error[-1]),
+        return_=played.reward.sum(axis=0),
+        collisions=played.collided.sum(axis=0, dtype=np.float64),
+        settling_time_s=played.period * settled_after(played.position_error),
+        highest_torque=np.abs(played.torque / effort_limit).max(axis=(0, 2)),
+        highest_velocity=np.abs(played.qd).max(axis=(0, 2)),
     )
 
 
-def _settled_after(error: NDArray[np.float64]) -> NDArray[np.float64]:
+def settled_after(error: NDArray[np.float64]) -> NDArray[np.float64]:
     """The number of steps after which the errors (T, N), m, stay within SETTLED of their last."""
     astray = np.abs(error - error[-1]) > SETTLED
     steps = len(error) - astray[::-1].argmax(axis=0)

@@ -15,7 +15,7 @@ from gym_mara.agents.evaluate import evaluate_run, make_env
 from gym_mara.agents.presets import Preset
 from gym_mara.agents.run import RunFolder
 from gym_mara.agents.train import resume, train
-from gym_mara.agents.transfer import SETTLED, _settled_after, transfer
+from gym_mara.agents.transfer import SETTLED, settled_after, transfer
 from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
 from gym_mara.errors import GymMaraError
 from tests.agents.conftest import config, silent
@@ -120,7 +120,7 @@ def test_a_wrong_transfer(dynamic_run: RunFolder, arguments: dict[str, Any], mes
 def test_an_arm_has_settled_once_its_error_stays_near_its_last() -> None:
     far, near = 1.0 + 2.0 * SETTLED, 1.0 + 0.5 * SETTLED
     errors = np.array([[far, near, near], [near, far, 1.0], [near, near, near], [1.0, 1.0, 1.0]])
-    assert _settled_after(errors).tolist() == [1.0, 2.0, 0.0]
+    assert settled_after(errors).tolist() == [1.0, 2.0, 0.0]
 
 
 def test_a_policy_of_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
