@@ -10,7 +10,8 @@ PIP_INSTALL = -m pip install --quiet --disable-pip-version-check
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
 
-test: $(READY) ## Run the tests.
+test: $(READY) ## Run the tests, some of them in Chromium.
+	.ci/chromium
 	$(BIN)/python -m pytest -n auto
 
 lint: $(READY) ## Check format, lint and types.
@@ -21,6 +22,7 @@ lint: $(READY) ## Check format, lint and types.
 bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some minutes.
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/dynamics.py
+	$(BIN)/python benchmarks/rendering.py
 
 experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
 	$(BIN)/gym-mara benchmark --out runs/experiment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -14,9 +14,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotModel
 from gym_mara.simulation import Mask, Simulation
 from gym_mara.tasks import Task
+
+if TYPE_CHECKING:
+    from gym_mara.rendering.viewer import Viewer
 
 Floats = NDArray[np.float64]
 
@@ -32,16 +36,16 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         robot: a robot's name, the path of a URDF, or a RobotModel.
         ee_frame: the end-effector link of a URDF of your own.
         backend: the name of a backend.
-        render_mode: None, the only one so far.
-        **options: values of the task (`target_position`, `on_collision`, …) and settings of the backend
-            (`max_joint_velocity`, …).
+        render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
+        **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
+            (`max_joint_velocity`, …) and of pictures (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`).
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
         MissingExtraError: a library is not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012 - Gymnasium's form
 
     def __init__(
         self,
@@ -53,9 +57,10 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        _check_render_mode(render_mode)
-        self.render_mode = render_mode
+        self.render_mode = _checked_render_mode(render_mode, self.metadata["render_modes"])
         self.simulation = Simulation(task, 1, robot, ee_frame, backend, options)
+        self._pictures = Pictures(self.simulation.robot, self.simulation.rendering)
+        self.viewer: Viewer | None = None
         self.observation_space = self.simulation.observation_space  # type: ignore[assignment]
         self.action_space = self.simulation.action_space
         self.metadata = self.metadata | {"render_fps": 1.0 / self.simulation.backend.control_period}
@@ -66,6 +71,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         """Begin an episode at the start pose; `options` has no meaning yet."""
         super().reset(seed=seed)
         observation = self.simulation.reset((self.np_random,))[0]
+        if self.render_mode == "human":
+            self._show()
         return observation, _info_of_one(self.simulation.backend.report())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -74,12 +81,40 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         Raises:
             GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
         """
-        outcome = self.simulation.step(np.asarray(action)[None])
+        targets: Any = np.asarray(action)[None]
+        if self.viewer is not None:
+            targets = self.viewer.before_step(self.simulation, targets)
+        outcome = self.simulation.step(targets)
+        if self.viewer is not None:
+            self.viewer.after_step(self.simulation, outcome)
         info = _info_of_one(outcome.info)
         # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
         return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The picture of what the last observation shows, uint8 (height, width, 3); None but for "rgb_array".
+
+        Raises:
+            MissingExtraError: no renderer is installed.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() draws nothing: give render_mode='rgb_array' or 'human'")
+        if self.render_mode != "rgb_array":
+            return None
+        return self._pictures.of(self.simulation.view(0))
+
+    def _show(self) -> None:
+        """Show the arm in the viewer, which is made when the first episode begins."""
+        if self.viewer is None:
+            from gym_mara.rendering.viewer import Viewer
+
+            self.viewer = Viewer(self.simulation)
+        self.viewer.show(self.simulation)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"viewer": None}  # a copy gets its own when it is reset
 
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arm, the episode and the random generator; it pickles."""
@@ -91,7 +126,11 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.np_random = copy.deepcopy(snapshot["np_random"])
 
     def close(self) -> None:
-        """Free the backend."""
+        """Free the backend, the renderer and the viewer."""
+        self._pictures.close()
+        if self.viewer is not None:
+            self.viewer.close()
+            self.viewer = None
         self.simulation.close()
 
 
@@ -102,7 +141,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     Args:
         num_envs: N.
-        task, robot, ee_frame, backend, render_mode, **options: as in MaraEnv.
+        task, robot, ee_frame, backend, **options: as in MaraEnv.
+        render_mode: "rgb_array" for pictures of every arm, or None.
         max_episode_steps: the length of an episode, after which it is truncated; None for no end.
         autoreset_mode: Gymnasium's: "NextStep", "SameStep" or "Disabled".
 
@@ -125,8 +165,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         **options: Any,
     ) -> None:
         self.closed = True  # until it is whole: Gymnasium closes even what could not be made
-        _check_render_mode(render_mode)
-        self.render_mode = render_mode
+        self.render_mode = _checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
         self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options)
@@ -138,10 +177,11 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
-            "render_modes": [],
+            "render_modes": ["rgb_array"],
             "render_fps": 1.0 / self.simulation.backend.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
+        self._pictures = Pictures(self.simulation.robot, self.simulation.rendering)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._generators: tuple[np.random.Generator, ...] = ()  # where episodes are random
         self.closed = False
@@ -232,6 +272,16 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             info[key][began] = values[began]
             info[f"_{key}"][began] = True
 
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A picture of each arm, of what its last observation shows; None without a render_mode.
+
+        Raises:
+            MissingExtraError: no renderer is installed.
+        """
+        if self.render_mode is None:
+            return None
+        return tuple(self._pictures.of(self.simulation.view(arm)) for arm in range(self.num_envs))
+
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arms, the episodes and the random generators; it pickles."""
         return self.simulation.save() | {
@@ -248,13 +298,15 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self._generators = copy.deepcopy(snapshot["generators"])
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the backend; called by close()."""
+        """Free the backend and the renderer; called by close()."""
+        self._pictures.close()
         self.simulation.close()
 
 
-def _check_render_mode(render_mode: str | None) -> None:
-    if render_mode is not None:
-        raise GymMaraError(f"render_mode {render_mode!r} is not supported yet; use None")
+def _checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
+    if render_mode is not None and render_mode not in known:
+        raise unknown("render_mode", render_mode, known)
+    return render_mode
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:

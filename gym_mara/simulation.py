@@ -12,12 +12,15 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.backends import make_backend
+from gym_mara import rotations
+from gym_mara.backends import backend_settings, make_backend
 from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.rendering.settings import RenderSettings
 from gym_mara.robot import RobotModel
-from gym_mara.state import SimState
+from gym_mara.robot.collision import touching_links
+from gym_mara.state import SimState, View
 from gym_mara.statistics import EpisodeStatistics
-from gym_mara.tasks import Task, make_task
+from gym_mara.tasks import Goal, Task, make_task
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -48,7 +51,7 @@ class Simulation:
         robot: a robot's name, the path of a URDF, or a RobotModel.
         ee_frame: the end-effector link of a URDF of your own.
         backend: the name of a backend.
-        options: values of the task and settings of the backend, by keyword.
+        options: values of the task, settings of the backend and of pictures, by keyword.
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
@@ -65,15 +68,22 @@ class Simulation:
         options: dict[str, Any],
     ) -> None:
         self.num_envs = whole_number("num_envs", num_envs)
-        self.task, settings = make_task(task, options)
+        self.rendering, options = RenderSettings.split(options)
+        self.task, self._settings = make_task(task, options)
         self.robot = RobotModel.load(robot, ee_frame)
-        of_task = [field.name for field in dataclasses.fields(self.task)]
-        self.backend = make_backend(backend, self.robot, self.num_envs, settings, of_task)
+        others = [
+            field.name for of in (self.task, self.rendering) for field in dataclasses.fields(of)
+        ]
+        self.backend = make_backend(backend, self.robot, self.num_envs, self._settings, others)
+        self.backend_name = backend
         self.goal = self.task.goal(self.robot, self.num_envs)
         start = self.robot.home if self.task.start_q is None else self.task.start_q
         self._start = np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1))
         self._started = False
         self._closed = False
+        # What the last step's observations are of; and the arms that have begun an episode since.
+        self._seen: tuple[SimState, dict[str, NDArray[Any]]] | None = None
+        self._began = np.zeros(self.num_envs, np.bool_)
         self.statistics = EpisodeStatistics(self.num_envs)
         self._kinematics = self.robot.kinematics()
         # The sensors' noise, from a generator for each arm's episode.
@@ -104,6 +114,7 @@ class Simulation:
         self.backend.reset(self._start, mask)
         self.statistics.clear(slice(None) if mask is None else mask)
         self._started = True
+        self._began[chosen] = True
         return self._observe(self.backend.state, chosen)
 
     def step(self, action: ArrayLike) -> Outcome:
@@ -118,6 +129,8 @@ class Simulation:
             raise ResetNeeded("call reset() before the first step()")
         state = self.backend.step(self._target(action))
         report = self.backend.report()
+        self._seen = state, report
+        self._began.fill(False)
         observation = self._observe(state)
         reward, info = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
@@ -130,6 +143,46 @@ class Simulation:
         self.statistics.add(distance, reward, collided)
         everything = {**info, "collided": collided, **report}
         return Outcome(observation, reward, terminated, self.backend.diverged, everything)
+
+    def view(self, arm: int) -> View:
+        """How an arm looks in its last observation: where it collided and was put back, it still collides there."""
+        self._check_open()
+        if self._seen is None or self._began[arm]:
+            state, report = self.backend.state, self.backend.report()
+        else:
+            state, report = self._seen
+        touching: frozenset[str] = frozenset()
+        if state.collided[arm]:
+            contacts = report["contacts"][arm] if "contacts" in report else ()
+            links = frozenset(link for contact in contacts for link in contact["links"])
+            touching = links or touching_links(self.robot, state.q[arm])
+        return View(state.q[arm], self.goal.position[arm], self.goal.quaternion[arm], touching)
+
+    def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
+        """Move the goal of every arm to a position (3,), m, and a unit quaternion (4,), [w, x, y, z]."""
+        quaternion = rotations.canonical(np.asarray(quaternion, np.float64))
+        shape = (self.num_envs, 1)
+        self.goal = Goal(
+            np.tile(np.asarray(position, np.float64), shape), np.tile(quaternion, shape)
+        )
+
+    def switch_backend(self, name: str) -> None:
+        """Go on in another backend, at rest where the joints are; it keeps those settings that it knows.
+
+        Raises:
+            GymMaraError: the name is unknown.
+            MissingExtraError: the backend's engine is not installed.
+        """
+        self._check_open()
+        known = backend_settings(name)
+        settings = {key: value for key, value in self._settings.items() if key in known}
+        backend = make_backend(name, self.robot, self.num_envs, settings)
+        if backend.random:
+            seeds = np.random.default_rng().integers(2**63, size=self.num_envs, dtype=np.uint64)
+            backend.begin_episodes(seeds, np.ones(self.num_envs, np.bool_))
+        backend.reset(self.backend.state.q.clip(self.robot.lower, self.robot.upper))
+        self.backend.close()
+        self.backend, self.backend_name, self._seen = backend, name, None
 
     def _observe(self, state: SimState, chosen: Mask | None = None) -> Floats:
         """What the task shows of the states, as the sensors of the arms, or of those chosen, see them."""
@@ -181,6 +234,7 @@ class Simulation:
         self.statistics = copy.deepcopy(snapshot["statistics"])
         self._noise = copy.deepcopy(snapshot["noise"])
         self._started = snapshot["started"]
+        self._seen = None
 
     def close(self) -> None:
         """Free the backend; closing twice does no harm."""

@@ -1,4 +1,4 @@
-"""SimState: what a backend reports, and all that a task sees of the simulation."""
+"""SimState: what a backend reports, and all that a task sees of the simulation. View: what a renderer sees of it."""
 
 from __future__ import annotations
 
@@ -29,3 +29,17 @@ class SimState:
     """(N,): links that may collide touched at this instant or at any during the last control period."""
     time: NDArray[np.float64]
     """Simulated time since the arm's last reset (N,), s."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class View:
+    """One arm at one instant, as it is to be shown."""
+
+    q: NDArray[np.float64]
+    """(J,), rad."""
+    target_position: NDArray[np.float64]
+    """(3,), m, in the world frame."""
+    target_quaternion: NDArray[np.float64]
+    """(4,), [w, x, y, z]."""
+    touching: frozenset[str] = frozenset()
+    """The links that collide."""

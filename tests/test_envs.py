@@ -472,7 +472,6 @@ def test_close_closes_the_backend(
         ),
         ({"orientation": "no"}, "orientation must be True or False, not 'no'"),
         ({"collision_penalty": 3}, "collision_penalty must be True or False, not 3"),
-        ({"render_mode": "human"}, r"render_mode 'human' is not supported yet; use None"),
         (
             {"ee_frame": "hand"},
             r"has no link 'hand' to be the end-effector frame; it has: .*ee_link",

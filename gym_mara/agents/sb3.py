@@ -39,6 +39,7 @@ class MaraVecEnv(VecEnv):
         super().__init__(
             env.num_envs, env.single_observation_space, Box(-1.0, 1.0, shape, np.float32)
         )
+        self.metadata = env.metadata
         self._low, self._high = env.simulation.target_low, env.simulation.target_high
         self._actions: NDArray[np.float32] = np.zeros((env.num_envs, *shape), np.float32)
         self._returns = np.zeros(env.num_envs)
@@ -101,6 +102,9 @@ class MaraVecEnv(VecEnv):
         """Go back to a snapshot."""
         self.env.restore_state(snapshot["env"])
         self._returns = snapshot["returns"].copy()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        return self.env.render() or [None] * self.num_envs
 
     def close(self) -> None:
         self.env.close()

@@ -142,3 +142,14 @@ class NoChecker(CollisionChecker):
 
     def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.zeros(len(q), dtype=np.bool_)
+
+
+def touching_links(robot: RobotModel, q: NDArray[np.float64]) -> frozenset[str]:
+    """The links that touch another at a configuration q (J,), rad, of the pairs that may collide."""
+    data = robot.geometry.createData()
+    pin.computeCollisions(robot.model, robot.model.createData(), robot.geometry, data, q, False)
+    touching: set[str] = set()
+    for pair, result in zip(robot.geometry.collisionPairs, data.collisionResults, strict=True):
+        if result.isCollision():
+            touching |= {robot.link_of(pair.first), robot.link_of(pair.second)}
+    return frozenset(touching)

@@ -17,7 +17,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import catalog
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain
+from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain, visual_geometry
 
 Floats = NDArray[np.float64]
 
@@ -127,6 +127,11 @@ class RobotModel:
     def ee_frame_id(self) -> int:
         """Pinocchio's number of the end-effector frame; a joint may bear the same name."""
         return int(self.model.getFrameId(self.ee_frame, pin.FrameType.BODY))
+
+    @cached_property
+    def visual(self) -> pin.GeometryModel:
+        """Pinocchio's visual geometry; read when first asked for."""
+        return visual_geometry(self.urdf, self.model)
 
     def kinematics(self) -> Kinematics:
         """Forward kinematics of many configurations at once, with a work space of its own."""

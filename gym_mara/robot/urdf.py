@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -82,14 +84,35 @@ def build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
     Raises:
         GymMaraError: Pinocchio does not take it, or a mesh is not found.
     """
+    with _told(urdf):
+        model = pin.buildModelFromXML(text)
+        return model, _geometry(urdf, model, text, pin.GeometryType.COLLISION)
+
+
+def visual_geometry(urdf: Path, model: pin.Model) -> pin.GeometryModel:
+    """What a URDF says that the links of a model look like; where it says nothing, their collision geometry.
+
+    Raises:
+        GymMaraError: a mesh is not found.
+    """
+    with _told(urdf):
+        text = urdf.read_text()
+        geometry = _geometry(urdf, model, text, pin.GeometryType.VISUAL)
+        if geometry.ngeoms == 0:
+            geometry = _geometry(urdf, model, text, pin.GeometryType.COLLISION)
+        return geometry
+
+
+def _geometry(urdf: Path, model: pin.Model, text: str, kind: pin.GeometryType) -> pin.GeometryModel:
     # Catalogues name meshes package://…; a package may be any folder above the URDF.
     ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
     folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
+    return pin.buildGeomFromUrdfString(model, text, kind, package_dirs=folders)
+
+
+@contextmanager
+def _told(urdf: Path) -> Iterator[None]:
     try:
-        model = pin.buildModelFromXML(text)
-        geometry = pin.buildGeomFromUrdfString(
-            model, text, pin.GeometryType.COLLISION, package_dirs=folders
-        )
-    except (ValueError, RuntimeError) as error:
+        yield
+    except (OSError, ValueError, RuntimeError) as error:
         raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {error}") from error
-    return model, geometry

@@ -1,0 +1,47 @@
+"""The contract of a renderer: it draws the views of one scene."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gym_mara.errors import GymMaraError
+from gym_mara.rendering.look import Look
+from gym_mara.rendering.scene import Scene
+from gym_mara.rendering.settings import RenderSettings
+from gym_mara.state import View
+
+Picture = NDArray[np.uint8]
+"""(height, width, 3), RGB."""
+
+
+class NoDisplayError(GymMaraError):
+    """A renderer is installed, but nothing here lets it draw."""
+
+
+class Renderer(ABC):
+    """Draws the views of one scene, seen from one place.
+
+    Args:
+        scene: what there is to see.
+        look: from where.
+        settings: the size of the pictures.
+        first: a view, to see what stands where.
+
+    Raises:
+        NoDisplayError: it cannot draw on this machine.
+    """
+
+    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
+        self.scene = scene
+        self.look = look
+        self.width, self.height = settings.width, settings.height
+
+    @abstractmethod
+    def render(self, view: View) -> Picture:
+        """The picture of a view, a fresh array."""
+
+    def close(self) -> None:  # noqa: B027 - some have nothing to free
+        """Free what it holds; nothing else is called afterwards."""

@@ -1,0 +1,199 @@
+"""What there is to see: the shapes of an arm and its surroundings, its target and tool, where they are, in what colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from gym_mara.errors import MissingExtraError
+from gym_mara.robot import RobotModel
+from gym_mara.state import View
+
+try:
+    import trimesh
+except ImportError as error:
+    raise MissingExtraError("rendering", "trimesh", "render") from error
+
+Floats = NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+COLLIDING: Colour = (0.86, 0.10, 0.08)
+"""What a link that collides is painted."""
+_AXES: tuple[Colour, ...] = ((0.90, 0.16, 0.16), (0.18, 0.66, 0.22), (0.16, 0.36, 0.90))
+_PLAIN: Colour = (0.7, 0.7, 0.72)
+_ROUND = 48
+"""How many sides stand for a circle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One rigid shape of one colour."""
+
+    name: str
+    link: str
+    """The link that it belongs to; "target" and "tool" are the frames drawn there."""
+    vertices: NDArray[np.float32]
+    """(V, 3), m, in a frame of its own."""
+    normals: NDArray[np.float32]
+    """(V, 3), outwards."""
+    faces: NDArray[np.int32]
+    """(F, 3), indices of vertices."""
+    colour: Colour
+    """In [0, 1]."""
+    fixed: bool = False
+    """Whether it never moves."""
+    marker: bool = False
+    """Whether it is a drawing and no body."""
+
+    def placed(self, placement: Floats) -> NDArray[np.float32]:
+        """The vertices (V, 3) in the world frame, m, where a homogeneous matrix (4, 4) places the part."""
+        rotation, position = placement[:3, :3].astype(np.float32), placement[:3, 3]
+        return self.vertices @ rotation.T + position.astype(np.float32)
+
+
+class Scene:
+    """The parts of a robot's scene, and where each of them is.
+
+    Args:
+        robot: the arm.
+
+    Raises:
+        GymMaraError: a mesh of the robot cannot be read.
+        MissingExtraError: trimesh is not installed.
+    """
+
+    def __init__(self, robot: RobotModel) -> None:
+        self.robot = robot
+        self._model, self._data = robot.model, robot.model.createData()
+        self._geometry = robot.visual
+        self._geometry_data = self._geometry.createData()
+        parts: list[Part] = []
+        self._placed_by: list[int] = []
+        for index, shape in enumerate(self._geometry.geometryObjects):
+            link = str(self._model.frames[shape.parentFrame].name)
+            for mesh, colour in _meshes_of(shape):
+                name = f"{shape.name}/{len(parts)}"
+                parts.append(_part(name, link, mesh, colour, fixed=shape.parentJoint == 0))
+                self._placed_by.append(index)
+        self._bodies = len(parts)
+        parts += _frame("target", 0.14, 0.006) + _frame("tool", 0.09, 0.003)
+        self.parts: tuple[Part, ...] = tuple(parts)
+
+    def placements(self, view: View) -> Floats:
+        """Where each part is: its frame in the world frame, homogeneous matrices (P, 4, 4)."""
+        pin.forwardKinematics(self._model, self._data, view.q)
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data)
+        tool = pin.updateFramePlacement(self._model, self._data, self.robot.ee_frame_id)
+        bodies = [placement.homogeneous for placement in self._geometry_data.oMg]
+        target = np.eye(4)
+        target[:3, :3] = pin.Quaternion(*view.target_quaternion).matrix()
+        target[:3, 3] = view.target_position
+        of_part = {"target": target, "tool": tool.homogeneous}
+        markers = [of_part[part.link] for part in self.parts[self._bodies :]]
+        return np.array([bodies[index] for index in self._placed_by] + markers)
+
+    def colours(self, view: View) -> list[Colour]:
+        """The colour of each part; of a link that collides it is red."""
+        return [
+            COLLIDING if part.link in view.touching and not part.marker else part.colour
+            for part in self.parts
+        ]
+
+    def bounds(self, view: View, *, moving: bool = True) -> tuple[Floats, Floats]:
+        """The lowest and the highest corner (3,), m, of what moves, or of everything, the target included."""
+        corners = [view.target_position[None].astype(np.float32)]
+        for part, placement in zip(self.parts, self.placements(view), strict=True):
+            if not part.marker and not (moving and part.fixed):
+                corners.append(part.placed(placement))
+        points = np.concatenate(corners)
+        return points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+
+
+def _meshes_of(shape: pin.GeometryObject) -> list[tuple[trimesh.Trimesh, Colour]]:
+    """The meshes of a visual of a URDF, in its frame, each with its colour."""
+    red, green, blue, _ = np.asarray(shape.meshColor, float).tolist()
+    own: Colour = (red, green, blue)
+    primitive = _primitive(shape.geometry)
+    if primitive is not None:
+        return [(_with_creases(primitive), own)]
+    found = []
+    for mesh in trimesh.load_scene(shape.meshPath).dump():
+        if isinstance(mesh, trimesh.Trimesh):
+            mesh.apply_scale(np.asarray(shape.meshScale))
+            colour = own if shape.overrideMaterial else _colour_of(mesh)
+            # The other formats say where a surface is smooth.
+            is_stl = shape.meshPath.lower().endswith(".stl")
+            found.append((_with_creases(mesh) if is_stl else mesh, colour))
+    return found
+
+
+def _primitive(geometry: Any) -> trimesh.Trimesh | None:
+    """The mesh of one of a URDF's own shapes; None for a mesh from a file."""
+    kind = type(geometry).__name__
+    if kind == "Box":
+        return trimesh.creation.box(2.0 * np.asarray(geometry.halfSide))
+    if kind == "Sphere":
+        return trimesh.creation.icosphere(subdivisions=3, radius=geometry.radius)
+    if kind == "Cylinder":
+        height = 2.0 * geometry.halfLength
+        return trimesh.creation.cylinder(geometry.radius, height, sections=_ROUND)
+    if kind == "Capsule":
+        height = 2.0 * geometry.halfLength
+        mesh = trimesh.creation.capsule(height, geometry.radius, count=(_ROUND, _ROUND))
+        mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
+        return mesh
+    return None
+
+
+def _with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with its vertices doubled along sharp edges, so that normals do not run round them."""
+    return trimesh.graph.smooth_shade(mesh, angle=np.radians(30.0))
+
+
+def _colour_of(mesh: Any) -> Colour:
+    """The colour that a mesh's file gives it."""
+    if mesh.visual.kind == "texture":
+        rgba = np.asarray(mesh.visual.material.main_color, float)
+    elif mesh.visual.kind in ("face", "vertex"):
+        rgba = np.asarray(mesh.visual.main_color, float)
+    else:
+        return _PLAIN
+    red, green, blue = (rgba[:3] / 255.0).tolist()
+    return red, green, blue
+
+
+def _part(
+    name: str,
+    link: str,
+    mesh: trimesh.Trimesh,
+    colour: Colour,
+    *,
+    fixed: bool = False,
+    marker: bool = False,
+) -> Part:
+    return Part(
+        name=name,
+        link=link,
+        vertices=np.ascontiguousarray(mesh.vertices, np.float32),
+        normals=np.ascontiguousarray(mesh.vertex_normals, np.float32),
+        faces=np.ascontiguousarray(mesh.faces, np.int32),
+        colour=colour,
+        fixed=fixed,
+        marker=marker,
+    )
+
+
+def _frame(link: str, length: float, radius: float) -> list[Part]:
+    """A frame drawn as three rods along x, y and z, red, green and blue."""
+    parts = []
+    for axis, colour in enumerate(_AXES):
+        ends = np.zeros((2, 3))
+        ends[1, axis] = length
+        rod = trimesh.creation.cylinder(radius=radius, segment=ends, sections=16)
+        name = f"{link}/{'xyz'[axis]}"
+        parts.append(_part(name, link, _with_creases(rod), colour, marker=True))
+    return parts

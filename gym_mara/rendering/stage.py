@@ -1,0 +1,100 @@
+"""The viewer's 3D scene in the browser."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import viser
+
+from gym_mara.rendering.look import BACKGROUND, VIEW_ANGLE, Look
+from gym_mara.rendering.scene import Colour, Floats, Scene
+from gym_mara.state import View
+
+
+class Stage:
+    """The parts of a scene as nodes of a viser server, a link's under one node; the target hangs on a handle to drag.
+
+    Args:
+        server: where they are shown.
+        scene: what there is to see.
+        look: from where a browser sees it first.
+        view: how it stands at first.
+    """
+
+    def __init__(self, server: viser.ViserServer, scene: Scene, look: Look, view: View) -> None:
+        self._server, self._scene = server, scene
+        server.scene.set_up_direction("+z")
+        server.scene.configure_default_lights(cast_shadow=True)
+        server.scene.set_background_image(np.full((1, 1, 3), _bytes(BACKGROUND), np.uint8))
+        server.scene.add_grid(
+            "/floor",
+            width=4.0,
+            height=4.0,
+            position=look.floor,
+            cell_color=(210, 214, 218),
+            section_color=(190, 195, 200),
+            shadow_opacity=0.2,
+        )
+        camera = server.initial_camera
+        camera.position, camera.look_at = tuple(look.eye), tuple(look.at)
+        camera.fov = float(np.radians(VIEW_ANGLE))
+        self.target = server.scene.add_transform_controls(
+            "/target",
+            scale=0.2,
+            depth_test=False,
+            position=view.target_position,
+            wxyz=view.target_quaternion,
+        )
+        self._nodes: dict[str, Any] = {"target": self.target}
+        self._leaders: dict[str, int] = {}
+        self._meshes: list[Any] = []
+        placements = scene.placements(view)
+        for index, part in enumerate(scene.parts):
+            if part.link not in self._leaders:  # the link's first part leads the others
+                self._leaders[part.link] = index
+                if part.link not in self._nodes:
+                    node = server.scene.add_frame(f"/{part.link}", show_axes=False)
+                    self._nodes[part.link] = node
+            leader = placements[self._leaders[part.link]]
+            wxyz, position = _pose(np.linalg.inv(leader) @ placements[index])
+            self._meshes.append(
+                server.scene.add_mesh_simple(
+                    f"/{part.link}/{index}",
+                    part.vertices,
+                    part.faces,
+                    color=_bytes(part.colour),
+                    side="double",
+                    cast_shadow=not part.marker,
+                    receive_shadow=not part.marker,
+                    wxyz=wxyz,
+                    position=position,
+                )
+            )
+        self._colours = [part.colour for part in scene.parts]
+        self.show(view)
+
+    def show(self, view: View) -> None:
+        """Move everything but the target, which the user's hand moves, to where it is in a view."""
+        placements = self._scene.placements(view)
+        with self._server.atomic():
+            for link, leader in self._leaders.items():
+                if link != "target":
+                    node = self._nodes[link]
+                    node.wxyz, node.position = _pose(placements[leader])
+            for index, colour in enumerate(self._scene.colours(view)):
+                if colour != self._colours[index]:
+                    self._meshes[index].color = _bytes(colour)
+                    self._colours[index] = colour
+
+
+def _bytes(colour: Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * value) for value in colour)
+    return red, green, blue
+
+
+def _pose(placement: Floats) -> tuple[Floats, Floats]:
+    """A homogeneous matrix (4, 4) as quaternion [w, x, y, z] and position."""
+    x, y, z, w = pin.Quaternion(placement[:3, :3]).coeffs()
+    return np.array([w, x, y, z]), placement[:3, 3].copy()

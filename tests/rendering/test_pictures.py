@@ -1,0 +1,392 @@
+"""Pictures: the contract of the renderers, and what a picture must show."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from gymnasium.wrappers import RecordVideo
+from numpy.typing import NDArray
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecVideoRecorder
+
+from gym_mara.agents.evaluate import make_env
+from gym_mara.backends import backend_names
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.rendering import CAMERAS, RENDERERS
+from gym_mara.rendering.look import VIEW_ANGLE
+from tests.helpers import COLLIDING_Q, COPIES, TARGET_Q
+
+Picture = NDArray[np.uint8]
+
+STORED = Path(__file__).parents[1] / "data" / "pictures"
+SMALL: dict[str, Any] = {"width": 320, "height": 240}
+POSES = {"home": (0.0,) * 6, "target": TARGET_Q, "collision": COLLIDING_Q}
+
+
+def picture(q: tuple[float, ...] = POSES["home"], **options: Any) -> Picture:
+    """The picture of MARA after a step to q."""
+    env = MaraEnv(render_mode="rgb_array", **{**SMALL, **options})
+    try:
+        env.reset(seed=0)
+        env.step(np.array(q, np.float32))
+        return draw(env)
+    finally:
+        env.close()
+
+
+def draw(env: MaraEnv) -> Picture:
+    """The picture of an environment that draws."""
+    drawn = env.render()
+    assert drawn is not None
+    return drawn
+
+
+def red(drawn: Picture) -> int:
+    """How many pixels have the red of a collision."""
+    r, g, b = np.moveaxis(drawn.astype(int), -1, 0)
+    return int(((r > 90) & (g < 0.4 * r) & (b < 0.4 * r)).sum())
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_a_picture_is_as_it_was(renderer: str, name: str) -> None:
+    drawn = picture(POSES[name], renderer=renderer)
+    stored = imageio.imread(STORED / f"{name}_{renderer}.png")
+    difference = np.abs(drawn.astype(int) - stored.astype(int))
+    assert difference.mean() < 1.0
+    assert (difference.max(axis=-1) > 40).mean() < 0.01
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_the_renderers_draw_the_same_scene(name: str) -> None:
+    vtk, raycast = (picture(POSES[name], renderer=r).astype(int) for r in ("vtk", "raycast"))
+    assert (np.abs(vtk - raycast).max(axis=-1) > 40).mean() < 0.05
+
+
+def test_a_picture_is_a_fresh_array_of_the_size_asked_for(renderer: str) -> None:
+    env = MaraEnv(render_mode="rgb_array", width=161, height=99, renderer=renderer)
+    env.reset()
+    first = draw(env)
+    kept = first.copy()
+    env.step(np.array(TARGET_Q, np.float32))
+    second = draw(env)
+    for drawn in (first, second):
+        assert drawn.shape == (99, 161, 3)
+        assert drawn.dtype == np.uint8
+    assert (first != second).any()
+    np.testing.assert_array_equal(first, kept)
+    env.close()
+
+
+@pytest.mark.parametrize("backend", backend_names())
+def test_links_that_collide_are_red_until_the_next_step(renderer: str, backend: str) -> None:
+    env = MaraEnv(render_mode="rgb_array", backend=backend, renderer=renderer, **SMALL)
+    env.reset(seed=0)
+    counts, hits = [], []
+    for step in range(90):
+        q = COLLIDING_Q if step < 80 else POSES["home"]
+        *_, info = env.step(np.array(q, np.float32))
+        if info["collided"] or step >= 85:
+            counts.append(red(draw(env)))
+            hits.append(info["collided"])
+        if info["collided"]:
+            break
+    assert hits[-1], "the arm did not collide"
+    env.step(np.array(POSES["home"], np.float32))
+    assert counts[-1] > 1000 + red(draw(env))
+    env.reset()
+    assert red(draw(env)) < 100, "the target's and the tool's x axes only"
+    env.close()
+
+
+def test_only_links_that_collide_are_red() -> None:
+    env = MaraEnv(render_mode="rgb_array")
+    env.reset()
+    env.step(np.array(COLLIDING_Q, np.float32))
+    touching = env.simulation.view(0).touching
+    assert "table" in touching
+    assert "base_robot" not in touching
+    assert 2 <= len(touching) < 8
+    env.close()
+
+
+def project(point: NDArray[np.float64], env: MaraEnv) -> tuple[int, int]:
+    """The row and column of the pixel that shows a point, by the camera's own geometry."""
+    drawer: Any = env._pictures._renderer
+    look = drawer.look
+    forwards = (look.at - look.eye) / np.linalg.norm(look.at - look.eye)
+    right = np.cross(forwards, look.up)
+    right /= np.linalg.norm(right)
+    above = np.cross(right, forwards)
+    away = point - look.eye
+    scale = drawer.height / 2.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (away @ forwards)
+    row = (drawer.height - 1) / 2.0 - scale * (away @ above)
+    return round(row), round((drawer.width - 1) / 2.0 + scale * (away @ right))
+
+
+def test_the_target_is_where_it_belongs_as_a_frame(renderer: str) -> None:
+    target = (-0.3, -0.2, 1.1)
+    env = MaraEnv(
+        render_mode="rgb_array",
+        renderer=renderer,
+        target_position=target,
+        target_quaternion=(1.0, 0.0, 0.0, 0.0),
+    )
+    env.reset()
+    drawn = draw(env)
+    for axis in range(3):
+        tip = np.array(target)
+        tip[axis] += 0.1
+        row, column = project(tip, env)
+        colour = drawn[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).mean(axis=0)
+        assert colour.argmax() == axis, "x red, y green, z blue"
+        assert colour[axis] > 1.3 * np.delete(colour, axis).max()
+    env.close()
+
+
+def test_every_camera_sees_the_arm_from_elsewhere(renderer: str) -> None:
+    pictures = [picture(TARGET_Q, camera=camera, renderer=renderer) for camera in CAMERAS]
+    for index, one in enumerate(pictures):
+        dark = (one.max(axis=-1) < 60).sum()
+        assert dark > 300, "the arm's black parts"
+        for other in pictures[index + 1 :]:
+            assert (np.abs(one.astype(int) - other.astype(int)).max(axis=-1) > 40).mean() > 0.02
+
+
+def test_a_camera_may_stand_anywhere(renderer: str) -> None:
+    near = picture(renderer=renderer, camera=[[-0.6, -0.3, 1.6], [0.0, 0.0, 1.5]])
+    assert (near.max(axis=-1) < 60).mean() > 0.01
+    down = picture(renderer=renderer, camera=[[0.0, 0.0, 5.0], [0.0, 0.0, 0.0]])
+    assert np.ptp(down) > 100
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_a_copy_draws_by_itself(copy: Any) -> None:
+    env = MaraEnv(render_mode="rgb_array", **SMALL)
+    env.reset()
+    env.step(np.array(TARGET_Q, np.float32))
+    before = env.render()
+    copied = copy(env)
+    env.close()
+    np.testing.assert_array_equal(copied.render(), before)
+    copied.close()
+
+
+def test_two_environments_render_at_once(renderer: str) -> None:
+    alone = [picture(POSES[name], renderer=renderer) for name in ("home", "target")]
+    envs = [MaraEnv(render_mode="rgb_array", renderer=renderer, **SMALL) for _ in alone]
+    for env, name in zip(envs, ("home", "target"), strict=True):
+        env.reset()
+        env.step(np.array(POSES[name], np.float32))
+    for _ in range(3):
+        for env, expected in zip(envs, alone, strict=True):
+            np.testing.assert_array_equal(env.render(), expected)
+    for env in envs:
+        env.close()
+
+
+def test_environments_render_in_threads_of_their_own(renderer: str) -> None:
+    expected = picture(TARGET_Q, renderer=renderer)
+    drawn: list[Picture] = []
+
+    def draw_two() -> None:
+        drawn.extend(picture(TARGET_Q, renderer=renderer) for _ in range(2))
+
+    threads = [threading.Thread(target=draw_two) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=120)
+    assert len(drawn) == 4
+    for one in drawn:
+        np.testing.assert_array_equal(one, expected)
+
+
+def test_drawing_does_not_change_the_simulation() -> None:
+    def course(render_mode: str | None) -> list[Any]:
+        env = MaraEnv("MARACollisionOrient-v0", render_mode=render_mode, **SMALL)
+        results: list[Any] = [env.reset(seed=3)[0]]
+        rng = np.random.default_rng(0)
+        for _ in range(10):
+            observation, reward, *_ = env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32))
+            results += [observation, reward]
+            if render_mode:
+                env.render()
+        env.close()
+        return results
+
+    for plain, drawn in zip(course(None), course("rgb_array"), strict=True):
+        np.testing.assert_array_equal(plain, drawn)
+
+
+def test_a_vector_environment_draws_each_of_its_arms() -> None:
+    envs = MaraVectorEnv(2, render_mode="rgb_array", autoreset_mode="SameStep", **SMALL)
+    envs.reset(seed=0)
+    envs.step(np.array([POSES["home"], TARGET_Q]))
+    pictures = envs.render()
+    assert pictures is not None
+    np.testing.assert_array_equal(pictures[0], picture())
+    np.testing.assert_array_equal(pictures[1], picture(TARGET_Q))
+    envs.close()
+
+
+def test_without_a_render_mode_nothing_is_drawn() -> None:
+    env = gymnasium.make("gym_mara/MARA-v0")
+    env.reset()
+    with pytest.warns(UserWarning, match="render"):
+        assert env.render() is None
+    envs = MaraVectorEnv(2)
+    envs.reset()
+    assert envs.render() is None
+
+
+def test_what_draws_is_not_imported_before_a_picture_is_asked_for() -> None:
+    code = (
+        "import sys, gymnasium, gym_mara\n"
+        "env = gymnasium.make('gym_mara/MARA-v0', render_mode='rgb_array')\n"
+        "env.reset(); env.step(env.action_space.sample())\n"
+        "loaded = {'pyvista', 'vtkmodules', 'embreex', 'trimesh', 'viser', 'imageio'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("absent", "named"),
+    [(["pyvista", "embreex"], "PyVista"), (["trimesh"], "trimesh")],
+)
+def test_without_any_renderer_the_error_names_the_extra(
+    absent: list[str], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in list(sys.modules):
+        if module.startswith(("gym_mara.rendering.", *absent)):
+            monkeypatch.delitem(sys.modules, module)
+    for module in absent:
+        monkeypatch.setitem(sys.modules, module, None)
+    env = MaraEnv(render_mode="rgb_array")
+    env.reset()
+    with pytest.raises(MissingExtraError, match=rf"{named}.*gym_mara\[render\]"):
+        env.render()
+    env.close()
+
+
+def test_without_opengl_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = (
+        "import gymnasium, gym_mara, sys\n"
+        "env = gymnasium.make('gym_mara/MARA-v0', render_mode='rgb_array', renderer={})\n"
+        "env.reset(); picture = env.render()\n"
+        "assert picture.shape == (480, 640, 3)\n"
+        "assert 'gym_mara.rendering.raycast' in sys.modules\n"
+    )
+    # EGL finds no driver here, nor is there a display: VTK would take the process along.
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    subprocess.run([sys.executable, "-c", code.format(None)], check=True)
+    asked = [sys.executable, "-c", code.format("'vtk'")]
+    refused = subprocess.run(asked, check=False, capture_output=True, text=True)
+    assert refused.returncode == 1
+    assert "OpenGL" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"width": 0}, "width must be a whole number of at least 1"),
+        ({"height": -3}, "height"),
+        ({"width": 100_000}, "width must be at most 4096"),
+        ({"height": 2.5}, "height"),
+        ({"camera": "frnt"}, "Did you mean 'front'"),
+        ({"camera": [[0, 0, 1], [0, 0]]}, "camera must be one of"),
+        ({"camera": [[0, 0, 1], [0, 0, 1]]}, "camera must be one of"),
+        ({"camera": [[0, 0, np.nan], [0, 0, 1]]}, "camera must be one of"),
+        ({"renderer": "opengl"}, "unknown renderer"),
+        ({"viewer_port": 70_000}, "viewer_port must be at most"),
+        ({"render_mode": "ansi"}, "unknown render_mode"),
+        ({"widht": 3}, "Did you mean 'width'"),
+    ],
+)
+def test_a_wrong_value_is_told(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(GymMaraError, match=told):
+        MaraEnv(**options)
+    if "render_mode" not in options:
+        with pytest.raises(GymMaraError, match=told):
+            MaraVectorEnv(2, **options)
+
+
+def test_a_vector_environment_has_no_viewer() -> None:
+    with pytest.raises(GymMaraError, match="render_mode"):
+        MaraVectorEnv(2, render_mode="human")
+
+
+# MoviePy and imageio's reader leave pipes open.
+THEIR_WARNINGS = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning",
+    "ignore::ResourceWarning",
+    "ignore::pytest.PytestUnraisableExceptionWarning",
+)
+
+
+def frames(folder: Path) -> NDArray[np.uint8]:
+    """The pictures of the only film in a folder."""
+    (film,) = folder.glob("*.mp4")
+    return np.asarray(imageio.imread(film, plugin="FFMPEG"))
+
+
+@THEIR_WARNINGS
+def test_gymnasium_records_a_video(tmp_path: Path) -> None:
+    env = RecordVideo(
+        gymnasium.make("gym_mara/MARA-v0", render_mode="rgb_array", max_episode_steps=6, **SMALL),
+        str(tmp_path / "videos"),
+        disable_logger=True,
+    )
+    env.reset(seed=0)
+    for _ in range(6):
+        env.step(env.action_space.sample())
+    env.close()  # type: ignore[no-untyped-call]
+    assert frames(tmp_path / "videos").shape == (7, 240, 320, 3)
+
+
+def native() -> VecEnv:
+    return make_env("MARA-v0", "pinocchio", 2, {"render_mode": "rgb_array", **SMALL})
+
+
+def in_processes() -> VecEnv:
+    options = {"render_mode": "rgb_array", **SMALL}
+    spawned = {"start_method": "spawn"}
+    return make_vec_env(
+        "gym_mara:gym_mara/MARA-v0",
+        2,
+        env_kwargs=options,
+        vec_env_cls=SubprocVecEnv,
+        vec_env_kwargs=spawned,
+    )
+
+
+@THEIR_WARNINGS
+@pytest.mark.parametrize("make", [native, in_processes])
+def test_stable_baselines_records_a_video(make: Any, tmp_path: Path) -> None:
+    env = VecVideoRecorder(make(), str(tmp_path), lambda step: step == 0, video_length=4)
+    env.reset()
+    for _ in range(5):
+        env.step(np.array([env.action_space.sample() for _ in range(2)]))
+    env.close()
+    assert frames(tmp_path).shape[1:] == (480, 320, 3), "one above the other"
+
+
+def store() -> None:
+    """Store the pictures anew."""
+    for renderer in RENDERERS:
+        for name, q in POSES.items():
+            imageio.imwrite(STORED / f"{name}_{renderer}.png", picture(q, renderer=renderer))
+
+
+if __name__ == "__main__":
+    store()

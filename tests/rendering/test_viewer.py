@@ -1,0 +1,238 @@
+"""The viewer, in a real browser: what its user does there is done with the arm."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pinocchio
+import pytest
+from playwright.sync_api import Browser, Page
+
+from gym_mara.envs import MaraEnv
+from gym_mara.errors import GymMaraError
+from gym_mara.rendering.look import VIEW_ANGLE
+from tests.browser import chromium
+from tests.helpers import COLLIDING_Q, pickled
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser's server
+ACTION = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], np.float32)
+
+
+def until(true: Callable[[], bool], what: str, seconds: float = 30.0) -> None:
+    """Wait until something is true."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
+        time.sleep(0.02)
+
+
+class Loop(threading.Thread):
+    """A program that steps an environment with a viewer, as a user's does."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(daemon=True)
+        self.env = MaraEnv(render_mode="human", **{"max_joint_velocity": 1.5, **options})
+        self.env.reset(seed=0)
+        self.steps = 0
+        self.observation, self.info = self.env.step(ACTION)[0::4]
+        self._stopped = threading.Event()
+        assert self.env.viewer is not None
+        self.viewer = self.env.viewer
+
+    def run(self) -> None:
+        while not self._stopped.is_set():
+            self.observation, self.info = self.env.step(ACTION)[0::4]
+            self.steps += 1
+
+    @property
+    def q(self) -> Any:
+        return self.observation[:6]
+
+    def stop(self) -> None:
+        """Stop stepping, paused or not, and close the environment."""
+        self._stopped.set()
+        self.viewer.set_playing(True)
+        self.join(timeout=20)
+        assert not self.is_alive()
+        self.env.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    stepping = Loop()
+    stepping.start()
+    try:
+        yield stepping
+    finally:
+        stepping.stop()
+
+
+@pytest.fixture
+def page(browser: Browser, loop: Loop) -> Iterator[Page]:
+    opened = browser.new_page(viewport={"width": 900, "height": 700})
+    opened.goto(loop.viewer.url)
+    opened.get_by_role("button", name="Pause").wait_for()
+    yield opened
+    opened.close()
+
+
+def test_pause_step_and_play(page: Page, loop: Loop) -> None:
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Play").wait_for()
+    time.sleep(0.3)
+    held = loop.steps
+    time.sleep(0.5)
+    assert loop.steps == held
+    for count in (1, 2):
+        page.get_by_role("button", name="Step").click()
+        until(lambda count=count: loop.steps >= held + count, "a step")  # type: ignore[misc]
+        time.sleep(0.3)
+        assert loop.steps == held + count
+    page.get_by_role("button", name="Play").click()
+    until(lambda: loop.steps > held + 10, "ten steps more")
+
+
+def test_a_slider_that_is_moved_leads_the_joint_until_it_is_let_go(page: Page, loop: Loop) -> None:
+    until(lambda: abs(loop.q[0] - 0.3) < 1e-3, "the arm is where the action sends it")
+    page.get_by_role("slider").nth(2).focus()  # the first is the speed's
+    page.keyboard.press("End")
+    until(lambda: loop.q[1] > 1.5, "motor2 goes to its upper limit")
+    assert page.get_by_label("By hand").is_checked()
+    page.get_by_label("By hand").uncheck()
+    until(lambda: abs(loop.q[1]) < 1e-3, "the action leads again")
+
+
+def test_the_speed_is_that_of_the_slider(page: Page, loop: Loop) -> None:
+    def rate() -> float:
+        begin, steps = time.monotonic(), loop.steps
+        time.sleep(1.0)
+        return (loop.steps - steps) / (time.monotonic() - begin)
+
+    assert rate() < 55.0, "real time, 50 steps a second"
+    page.get_by_role("slider").first.focus()
+    page.keyboard.press("Home")  # a tenth
+    time.sleep(0.5)
+    assert rate() < 8.0
+
+
+def test_the_backend_can_be_switched(page: Page, loop: Loop) -> None:
+    page.get_by_role("combobox").last.click()
+    page.get_by_role("option", name="dart").click()
+    until(lambda: "joint_torque" in loop.info, "DART reports torques")
+    assert loop.env.simulation.backend_name == "dart"
+    until(lambda: abs(loop.q[0] - 0.3) < 0.05, "and moves the arm")
+
+
+def test_the_target_is_dragged(page: Page, loop: Loop) -> None:
+    simulation = loop.env.simulation
+    goal, error = simulation.goal.position[0].copy(), loop.observation[6:9].copy()
+    axis = pinocchio.Quaternion(*simulation.goal.quaternion[0]).matrix()[:, 0]
+    grip, end = goal + 0.17 * axis, goal + 0.27 * axis  # the head of the handle's arrow along x
+
+    def pixel(point: Any) -> tuple[float, float]:
+        camera = loop.viewer.camera
+        forwards = (camera.at - camera.eye) / np.linalg.norm(camera.at - camera.eye)
+        right = np.cross(forwards, camera.up)
+        right /= np.linalg.norm(right)
+        away = point - camera.eye
+        scale = 350.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (away @ forwards)
+        return 450.0 + scale * (away @ right), 350.0 - scale * (away @ np.cross(right, forwards))
+
+    time.sleep(2.0)  # the scene is drawn in software here
+    page.mouse.move(*pixel(grip))
+    time.sleep(0.5)
+    page.mouse.down()
+    for share in np.linspace(0.0, 1.0, 8):
+        page.mouse.move(*pixel((1.0 - share) * grip + share * end))
+        time.sleep(0.1)
+    page.mouse.up()
+    until(lambda: bool((simulation.goal.position[0] != goal).any()), "the goal moves")
+    time.sleep(0.5)
+    moved = simulation.goal.position[0] - goal
+    assert 0.05 < moved @ axis < 0.15
+    np.testing.assert_allclose(moved, (moved @ axis) * axis, atol=1e-3)
+    until(
+        lambda: bool(np.allclose(loop.observation[6:9], error - moved, atol=0.01)), "it is observed"
+    )
+
+
+def test_reward_and_distance_are_plotted(page: Page, loop: Loop) -> None:
+    page.locator(".uplot").first.wait_for()
+    assert page.locator(".uplot").count() == 2
+    for label in ("Reward", "Position error, mm"):
+        assert page.get_by_text(label, exact=True).is_visible()
+
+
+def test_the_page_is_told_when_the_environment_closes(browser: Browser) -> None:
+    loop = Loop()
+    loop.start()
+    page = browser.new_page()
+    page.goto(loop.viewer.url)
+    page.get_by_role("button", name="Pause").click()  # a paused program is not held for ever either
+    loop.stop()
+    page.get_by_text("The environment was closed").wait_for()
+    page.close()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", int(loop.viewer.url.rsplit(":", 1)[1])))
+
+
+def test_nobody_at_the_browser_holds_nothing_up() -> None:
+    loop = Loop()
+    loop.viewer.set_playing(False)
+    loop.start()
+    until(lambda: loop.steps > 3, "steps without a browser")
+    loop.stop()
+
+
+def test_a_port_in_use_is_passed_over(capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = Loop(viewer_port=8200), Loop(viewer_port=8200)
+    ports = [int(loop.viewer.url.rsplit(":", 1)[1]) for loop in (first, second)]
+    assert ports[1] == ports[0] + 1
+    assert f"port 8200 is in use; the viewer takes {ports[1]}" in capsys.readouterr().out
+    for loop in (first, second):
+        loop.env.close()
+
+
+def test_it_listens_on_this_machine_alone() -> None:
+    loop = Loop()
+    host, port = loop.viewer.url.removeprefix("http://").split(":")
+    assert host == "127.0.0.1"
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as other:
+        other.bind(("127.0.0.2", int(port)))  # which would be in use, were it listening everywhere
+    loop.env.close()
+
+
+def test_an_address_that_is_not_ours_is_refused() -> None:
+    env = MaraEnv(render_mode="human", viewer_host="192.0.2.1")
+    with pytest.raises(GymMaraError, match="viewer_host"):
+        env.reset()
+    env.close()
+
+
+def test_a_copy_has_no_viewer_until_it_is_reset() -> None:
+    loop = Loop()
+    copied = pickled(loop.env)
+    assert copied.viewer is None
+    copied.step(ACTION)
+    copied.close()
+    loop.env.close()
+
+
+def test_what_collides_is_shown() -> None:
+    loop = Loop(max_joint_velocity=None)
+    loop.env.step(np.array(COLLIDING_Q, np.float32))
+    assert loop.env.simulation.view(0).touching
+    assert loop.env.render() is None
+    loop.env.close()
