@@ -46,7 +46,19 @@ def test_list_names_everything(gym_mara: Cli) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["train", "evaluate", "transfer", "benchmark", "plot", "search", "rewards", "list"]
+    "command",
+    [
+        "train",
+        "evaluate",
+        "transfer",
+        "watch",
+        "report",
+        "benchmark",
+        "plot",
+        "search",
+        "rewards",
+        "list",
+    ],
 )
 def test_help_helps(gym_mara: Cli, command: str) -> None:
     code, out, _ = gym_mara(command, "--help")

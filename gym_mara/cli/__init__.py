@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from gym_mara.cli import agents, environments, experiments
+from gym_mara.cli import agents, environments, experiments, viewing
 from gym_mara.errors import GymMaraError
 
 app = typer.Typer(
@@ -20,6 +20,8 @@ app = typer.Typer(
 app.command()(agents.train)
 app.command()(agents.evaluate)
 app.command()(agents.transfer)
+app.command()(viewing.watch)
+app.command()(viewing.report)
 app.command()(experiments.benchmark)
 app.command()(experiments.plot)
 app.command()(experiments.search)
