@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
-from gym_mara.rendering import Pictures
+from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.robot import RobotModel
 from gym_mara.simulation import Mask, Simulation
 from gym_mara.tasks import Task
@@ -58,8 +58,10 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         **options: Any,
     ) -> None:
         self.render_mode = _checked_render_mode(render_mode, self.metadata["render_modes"])
-        self.simulation = Simulation(task, 1, robot, ee_frame, backend, options)
-        self._pictures = Pictures(self.simulation.robot, self.simulation.rendering)
+        self._rendering, options = RenderSettings.split(options)
+        others = RenderSettings.names()
+        self.simulation = Simulation(task, 1, robot, ee_frame, backend, options, others)
+        self._pictures = Pictures(self.simulation.robot, self._rendering)
         self.viewer: Viewer | None = None
         self.observation_space = self.simulation.observation_space  # type: ignore[assignment]
         self.action_space = self.simulation.action_space
@@ -110,7 +112,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         if self.viewer is None:
             from gym_mara.rendering.viewer import Viewer
 
-            self.viewer = Viewer(self.simulation)
+            self.viewer = Viewer(self.simulation, self._rendering)
         self.viewer.show(self.simulation)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -168,7 +170,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.render_mode = _checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
-        self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options)
+        rendering, options = RenderSettings.split(options)
+        others = RenderSettings.names()
+        self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options, others)
         self.num_envs = self.simulation.num_envs
         self.single_observation_space = self.simulation.observation_space
         self.single_action_space = self.simulation.action_space
@@ -181,7 +185,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "render_fps": 1.0 / self.simulation.backend.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._pictures = Pictures(self.simulation.robot, self.simulation.rendering)
+        self._pictures = Pictures(self.simulation.robot, rendering)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._generators: tuple[np.random.Generator, ...] = ()  # where episodes are random
         self.closed = False

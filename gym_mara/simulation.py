@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
 from gym_mara.errors import GymMaraError, whole_number
-from gym_mara.rendering.settings import RenderSettings
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import touching_links
 from gym_mara.state import SimState, View
@@ -51,7 +50,8 @@ class Simulation:
         robot: a robot's name, the path of a URDF, or a RobotModel.
         ee_frame: the end-effector link of a URDF of your own.
         backend: the name of a backend.
-        options: values of the task, settings of the backend and of pictures, by keyword.
+        options: values of the task and settings of the backend, by keyword.
+        others: what else is a keyword argument where these come from; an error about an unknown one names them too.
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
@@ -66,15 +66,13 @@ class Simulation:
         ee_frame: str | None,
         backend: str,
         options: dict[str, Any],
+        others: Sequence[str] = (),
     ) -> None:
         self.num_envs = whole_number("num_envs", num_envs)
-        self.rendering, options = RenderSettings.split(options)
         self.task, self._settings = make_task(task, options)
         self.robot = RobotModel.load(robot, ee_frame)
-        others = [
-            field.name for of in (self.task, self.rendering) for field in dataclasses.fields(of)
-        ]
-        self.backend = make_backend(backend, self.robot, self.num_envs, self._settings, others)
+        known = [*(field.name for field in dataclasses.fields(self.task)), *others]
+        self.backend = make_backend(backend, self.robot, self.num_envs, self._settings, known)
         self.backend_name = backend
         self.goal = self.task.goal(self.robot, self.num_envs)
         start = self.robot.home if self.task.start_q is None else self.task.start_q

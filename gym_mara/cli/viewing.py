@@ -72,6 +72,8 @@ def watch(
 
 
 def _by_hand(task: str, backend: str, speed: float, options: dict[str, Any]) -> None:
+    # A hand that leads the arm into the table wants to see it there, and not back at home.
+    options = {"on_collision": "continue", **options}
     env = MaraEnv(task, backend=backend, render_mode="human", **options)
     try:
         env.reset()

@@ -54,9 +54,14 @@ class RenderSettings:
             raise unknown("camera", self.camera, CAMERAS)
 
     @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """The keyword arguments."""
+        return tuple(field.name for field in fields(cls))
+
+    @classmethod
     def split(cls, options: dict[str, Any]) -> tuple[RenderSettings, dict[str, Any]]:
         """The settings among keyword arguments, and what else there is among them."""
-        names = {field.name for field in fields(cls)}
+        names = cls.names()
         chosen = {name: value for name, value in options.items() if name in names}
         return cls(**chosen), {k: v for k, v in options.items() if k not in names}
 

@@ -48,12 +48,13 @@ class Viewer:
 
     Args:
         simulation: the simulation, reset.
+        settings: the camera that sees the scene at first, and the address to listen on.
 
     Raises:
         GymMaraError: the address cannot be listened on.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, settings: RenderSettings) -> None:
         self._wishes = threading.Condition()
         self._playing, self._single_steps, self._by_hand = True, 0, False
         self._goal: tuple[Floats, Floats] | None = None
@@ -62,11 +63,11 @@ class Viewer:
         self._period = simulation.backend.control_period
         self._low, self._high = simulation.target_low, simulation.target_high
         self._history: deque[dict[str, float]] = deque(maxlen=_HISTORY)
-        self._server = _serve(simulation.rendering, simulation.robot.name)
-        self.url = f"http://{simulation.rendering.viewer_host}:{self._server.get_port()}"
+        self._server = _serve(settings, simulation.robot.name)
+        self.url = f"http://{settings.viewer_host}:{self._server.get_port()}"
         """Where a browser finds it."""
         view, scene = simulation.view(0), Scene(simulation.robot)
-        self.camera = look_at(scene, view, simulation.rendering)
+        self.camera = look_at(scene, view, settings)
         """From where a browser sees the scene at first."""
         self._stage = Stage(self._server, scene, self.camera, view)
         self._build_controls(simulation)
