@@ -158,7 +158,8 @@ class Simulation:
 
     def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
         """Move the goal of every arm to a position (3,), m, and a unit quaternion (4,), [w, x, y, z]."""
-        quaternion = rotations.canonical(np.asarray(quaternion, np.float64))
+        quaternion = rotations.normalised(np.asarray(quaternion, np.float64))
+        quaternion = rotations.canonical(quaternion)
         shape = (self.num_envs, 1)
         self.goal = Goal(
             np.tile(np.asarray(position, np.float64), shape), np.tile(quaternion, shape)

@@ -40,7 +40,9 @@ def watch(
     video: Annotated[
         Path | None, typer.Option(help="New file, .mp4 or .gif, instead of the browser.")
     ] = None,
-    speed: Annotated[float, typer.Option(help="How much faster than real time.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(help="How much faster than real time; in the browser from 0.1 to 5.")
+    ] = 1.0,
     seconds: Annotated[float, typer.Option(help="How much of the episode a video shows, s.")] = 6.0,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:

@@ -31,6 +31,8 @@ _FRAME_PERIOD = 1.0 / 30.0
 """Between two pictures in the browser, s."""
 _PLOT_PERIOD = 0.2
 """Between two updates of the plots and sliders, s."""
+_SLIDER_STEP = 0.001
+"""rad."""
 _HISTORY = 300
 """How many steps the plots show."""
 _FAREWELL = 0.3
@@ -74,6 +76,8 @@ class Viewer:
 
     def _build_controls(self, simulation: Simulation) -> None:
         gui = self._server.gui
+        # What listens on this machine alone must not be shared with the world by a click.
+        gui.configure_theme(show_share_button=False)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self._step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
         self._speed = gui.add_slider(
@@ -93,18 +97,20 @@ class Viewer:
             start = simulation.view(0).q.clip(self._low, self._high)
             bounds = zip(simulation.robot.joint_names, self._low, self._high, start, strict=True)
             for name, low, high, value in bounds:
-                slider = gui.add_slider(name, low, high, step=0.001, initial_value=float(value))
+                slider = gui.add_slider(
+                    name, low, high, step=_SLIDER_STEP, initial_value=float(value)
+                )
                 slider.on_update(self._hear_slider)
                 self._sliders.append(slider)
         self._plots: list[tuple[list[str], float, Any]] = []
 
     def _build_plots(self, shown: dict[str, float]) -> None:
-        """A plot of the reward and its terms, and one of the position error."""
+        """A plot of the reward and its terms, and one of the position error, which spans powers of ten."""
         rewards = [name for name in shown if name.startswith("reward")]
         distance = [name for name in shown if name in ("position_error", "distance")][-1:]
-        for title, names, scale in (
-            ("Reward", rewards, 1.0),
-            ("Position error, mm", distance, 1e3),
+        for title, names, scale, y in (
+            ("Reward", rewards, 1.0, viser.uplot.Scale(auto=True)),
+            ("Position error, mm", distance, 1e3, viser.uplot.Scale(auto=True, distr=3)),
         ):
             if not names:
                 continue
@@ -114,8 +120,8 @@ class Viewer:
                     viser.uplot.Series(label=name.removeprefix("reward_"), stroke=colour, width=1.5)
                     for name, colour in zip(names, _COLOURS, strict=False)
                 ]
-                empty = tuple(np.zeros(1) for _ in series)
-                scales = {"x": viser.uplot.Scale(time=False, auto=True)}
+                empty = tuple(np.ones(1) for _ in series)
+                scales = {"x": viser.uplot.Scale(time=False, auto=True), "y": y}
                 plot = self._server.gui.add_uplot(empty, tuple(series), scales=scales, aspect=1.6)
             self._plots.append((names, scale, plot))
 
@@ -230,7 +236,8 @@ class Viewer:
         if not self._by_hand:
             q = simulation.view(0).q
             for slider, value in zip(self._sliders, q.clip(self._low, self._high), strict=True):
-                slider.value = float(value)
+                if abs(slider.value - value) > _SLIDER_STEP:
+                    slider.value = float(value)
 
     def close(self) -> None:
         """Tell whoever looks, and stop listening."""
