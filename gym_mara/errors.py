@@ -26,6 +26,10 @@ class MissingExtraError(GymMaraError, ImportError):
         return type(self), (self.part, self.library, self.extra)
 
 
+class TrainingDivergedError(GymMaraError):
+    """A training cannot go on: its numbers are no longer finite."""
+
+
 def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = False) -> float:
     """A value that must be a finite, positive number, or zero where that is allowed.
 

@@ -61,6 +61,9 @@ class Grid:
             raise unknown("backend", self.backend, backend_names())
         if self.preset_name not in PRESETS:
             raise unknown("preset", self.preset_name, PRESETS)
+        for names in (self.envs, self.algos):
+            if len(set(names)) < len(names):
+                raise GymMaraError(f"{', '.join(names)}: name each once")
         for name in ("seeds", "steps", "checkpoint_every"):
             whole_number(name, getattr(self, name))
 

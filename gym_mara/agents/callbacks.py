@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.evaluate import make_env, play
+from gym_mara.agents.plot import plot_learning_curve
 from gym_mara.agents.policy import normalisation, save_policy
 from gym_mara.agents.run import RunFolder
 from gym_mara.agents.sb3 import MaraVecEnv
@@ -42,6 +43,7 @@ class Keeper(BaseCallback):
         self.report = report
         self.shown: dict[str, float] = {}
         self._next = 0
+        self._eval_env: MaraVecEnv | None = None
 
     def _on_training_start(self) -> None:
         self._next = self.num_timesteps + self.run.config.checkpoint_every
@@ -68,8 +70,14 @@ class Keeper(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.checkpoint()
+        plot_learning_curve(self.run)
+        # What makes the run a finished one comes last.
         save_policy(self.run.path / "last", self.model)  # type: ignore[arg-type]
-        self._eval_env.close()
+
+    def close(self) -> None:
+        """Free the environment of the evaluations."""
+        if self._eval_env is not None:
+            self._eval_env.close()
 
     def checkpoint(self) -> None:
         """Evaluate, keep the policy if it is the best so far, and write a checkpoint."""
@@ -78,6 +86,7 @@ class Keeper(BaseCallback):
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[f"eval_{name}"] = value
+        self.shown["evaluations"] = self.shown.get("evaluations", 0) + 1
         elapsed = time.monotonic() - self._began
         self.logger.record("time/total_timesteps", steps)
         self.logger.record("time/time_elapsed", round(elapsed, 1))
@@ -97,6 +106,7 @@ class Keeper(BaseCallback):
 
     def _evaluate(self) -> dict[str, float]:
         trained = normalisation(self.model)  # type: ignore[arg-type]
+        assert self._eval_env is not None
         env = VecNormalize(
             self._eval_env,
             training=False,

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import TrainingDivergedError
 
 # How often a step is shortened until the model has moved no further than the trust region.
 _ATTEMPTS = 10
@@ -93,10 +93,10 @@ class KFAC(torch.optim.Optimizer):
             loss: -log p of an output that the model has drawn, for each example (N,).
 
         Raises:
-            GymMaraError: a loss is not finite; the factors have not changed then.
+            TrainingDivergedError: a loss is not finite; the factors have not changed then.
         """
         if not loss.isfinite().all():
-            raise GymMaraError(f"the model's predictions are not finite: {_ADVICE}")
+            raise TrainingDivergedError(f"the model's predictions are not finite: {_ADVICE}")
         outputs = [self._seen[layer][1] for layer in self._layers]
         gradients = torch.autograd.grad(loss.sum(), outputs, retain_graph=True)
         for layer, group, g in zip(self._layers, self.param_groups, gradients, strict=False):
@@ -123,11 +123,11 @@ class KFAC(torch.optim.Optimizer):
             How far the model has moved, as a KL divergence.
 
         Raises:
-            GymMaraError: a gradient is not finite; no parameter has changed then.
+            TrainingDivergedError: a gradient is not finite; no parameter has changed then.
         """
         gradients = [self._gradient(group) for group in self.param_groups]
         if not all(gradient.isfinite().all() for gradient in gradients):
-            raise GymMaraError(f"the gradient is not finite: {_ADVICE}")
+            raise TrainingDivergedError(f"the gradient is not finite: {_ADVICE}")
         if self.param_groups[0]["updates"] < self.cold_updates:
             norm = math.sqrt(sum(float(gradient.square().sum()) for gradient in gradients))
             shrink = min(1.0, self.max_grad_norm / (norm + 1e-8))
@@ -160,8 +160,9 @@ class KFAC(torch.optim.Optimizer):
         mean_a, mean_g = float(a.diagonal().mean()), float(g.diagonal().mean())
         # Of each factor's mean eigenvalue; rounding leaves the factors' smallest ones unknown to some 1e-6 of it.
         relative = max(math.sqrt(self.damping / max(mean_a * mean_g, 1e-30)), _LEAST_DAMPING)
-        a.diagonal().add_(relative * mean_a)
-        g.diagonal().add_(relative * mean_g)
+        # Where nothing flows, as through dead units, a factor is zero.
+        a.diagonal().add_(relative * mean_a or 1.0)
+        g.diagonal().add_(relative * mean_g or 1.0)
         left = torch.cholesky_solve(gradient.double(), torch.linalg.cholesky(g))
         return torch.cholesky_solve(left.T, torch.linalg.cholesky(a)).T.to(gradient.dtype)
 
@@ -180,6 +181,8 @@ class KFAC(torch.optim.Optimizer):
         """Make the steps, shortened as often as it takes."""
         origin = [[p.clone() for p in group["params"]] for group in self.param_groups]
         expected = self.divergence(steps)
+        if not math.isfinite(expected):
+            raise TrainingDivergedError(f"the step is not finite: {_ADVICE}")
         scale = math.sqrt(self.trust_region / max(expected, self.trust_region))
         try:
             for _ in range(_ATTEMPTS):

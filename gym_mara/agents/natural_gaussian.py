@@ -14,14 +14,19 @@ import math
 from typing import Any
 
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 
+from gym_mara.errors import GymMaraError
+
 # Standard deviations stay above this: much below it actions, which are float32 of order 1, no longer tell them apart.
 LEAST_STD = 1e-6
+# The widening makes none wider than this, half of an action's range.
+WIDEST_STD = 1.0
 
 
 class NaturalGaussian(Distribution):
@@ -81,10 +86,12 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
     """Stable-Baselines3's actor and critic with a NaturalGaussian, for box actions.
 
     Before each update the centre moves to the mean of the rollout's actions and the factor takes up what was learnt of
-    the covariance; neither changes the policy.
+    the covariance. This changes nothing of the policy but by `widening`: then the rollout was drawn from a policy that is
+    narrower by that, and the first ratios of an update differ from one by some hundredths.
 
-    The optimiser is plain gradient descent, torch's SGD: in these coordinates the plain gradient is the natural one. An
-    optimiser that gives every parameter steps of one size, such as Adam, makes noise of it.
+    The optimiser is plain gradient descent, torch's SGD: in these coordinates the plain gradient is the natural one. It
+    wants learning rates of 0.005 to 0.1. An optimiser that gives every parameter steps of one size, such as Adam, makes
+    noise of the gradient.
 
     Args:
         *args, **kwargs: as of ActorCriticPolicy.
@@ -92,11 +99,15 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         bias_rate: how fast what is common to the means of all states is learnt, relative to how they differ.
         widening: an entropy bonus, for algorithms that have none as well. Where an update has narrowed the distribution
             by e^-x in the direction that it narrowed most, the distribution is widened by e^(widening x) in all. So
-            directions of which the reward says little stay wide, and it ceases with the learning.
+            directions of which the reward says little stay wide. None becomes wider by it than a standard deviation of 1.
+
+    Raises:
+        GymMaraError: the actions are no box, or gSDE is asked for.
     """
 
     centre: Tensor
     factor: Tensor
+    _mean_sum: Tensor
     action_net: nn.Linear
     action_dist: NaturalGaussian
 
@@ -119,6 +130,8 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         }
 
     def _build(self, lr_schedule: Schedule) -> None:
+        if not isinstance(self.action_space, spaces.Box) or self.use_sde:
+            raise GymMaraError("NaturalGaussianPolicy wants box actions, and use_sde=False")
         super()._build(lr_schedule)
         size = self.action_net.out_features
         del self.log_std
@@ -126,7 +139,9 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         self.log_scale = nn.Parameter(torch.zeros(size, size))
         self.register_buffer("centre", torch.zeros(size))
         self.register_buffer("factor", torch.eye(size) * math.exp(self.log_std_init))
-        self._mean_sum, self._count = torch.zeros(size), 0
+        # The means of the rollout's states; of no use once it has ended.
+        self.register_buffer("_mean_sum", torch.zeros(size), persistent=False)
+        self._count = 0
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
@@ -162,7 +177,9 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         learnt = self._symmetric_log_scale()
         narrowed = -torch.linalg.eigvalsh(learnt).min().clamp(max=0.0)
         left, sizes, right = torch.linalg.svd(self.factor @ torch.matrix_exp(learnt))
-        sizes = (sizes * torch.exp(self.widening * narrowed)).clamp(min=LEAST_STD)
+        # Estimates that are noise narrow something at every update: what widens must end somewhere.
+        widened = (sizes * torch.exp(self.widening * narrowed)).clamp(max=WIDEST_STD)
+        sizes = torch.maximum(sizes, widened).clamp(min=LEAST_STD)
         self.factor.copy_(left @ torch.diag(sizes) @ right)
         self.log_scale.zero_()
         self.centre += self.factor @ mean

@@ -41,8 +41,8 @@ def run_tasks(
         KeyboardInterrupt: the user interrupted; no process is left.
     """
     jobs = whole_number("jobs", jobs)
-    for name in _ONE_THREAD:
-        os.environ[name] = "1"
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     waiting = list(tasks.items())
     running: dict[Connection, tuple[str, Any]] = {}
     failed: dict[str, str] = {}
@@ -54,8 +54,8 @@ def run_tasks(
                 process = _SPAWN.Process(target=_work, args=(task, mouth), name=name)
                 with _interrupts_later():
                     process.start()
+                    running[ear] = name, process
                 mouth.close()
-                running[ear] = name, process
             heard = wait(list(running))
             for ear in [ear for ear in running if ear in heard]:
                 name, process = running[ear]
@@ -76,6 +76,11 @@ def run_tasks(
             process.terminate()
         for _, process in running.values():
             process.join()
+        for variable, value in before.items():
+            if value is None:
+                del os.environ[variable]
+            else:
+                os.environ[variable] = value
     return failed
 
 

@@ -60,6 +60,17 @@ def algorithm_class(name: str) -> type[OnPolicyAlgorithm]:
     return ALGORITHMS[name]
 
 
+def policy_class(preset: Preset) -> type[ActorCriticPolicy]:
+    """The class of a preset's policy.
+
+    Raises:
+        GymMaraError: there is no such policy.
+    """
+    if preset.policy not in POLICY_CLASSES:
+        raise unknown("policy", preset.policy, POLICY_CLASSES)
+    return POLICY_CLASSES[preset.policy]
+
+
 def policy_arguments(preset: Preset) -> dict[str, Any]:
     """Keyword arguments of a preset's policy."""
     arguments = dict(preset.arguments.get("policy_kwargs", {}))
@@ -95,7 +106,7 @@ def load_policy(
         GymMaraError: the policy is one of another environment.
     """
     preset = Preset(**config.preset)
-    make = POLICY_CLASSES[preset.policy]
+    make = policy_class(preset)
     arguments = policy_arguments(preset)
     policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
     with _told(folder):
@@ -127,6 +138,9 @@ def _told(folder: Path) -> Iterator[None]:
     try:
         if not zipfile.is_zipfile(folder / "model.zip"):
             raise zipfile.BadZipFile("model.zip is missing or no zip file")
+        with zipfile.ZipFile(folder / "model.zip") as archive:
+            if broken := archive.testzip():
+                raise zipfile.BadZipFile(f"model.zip: {broken} is not what was written")
         yield
     except DAMAGE as error:
         raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error

@@ -21,6 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from gym_mara.agents.presets import Preset
 from gym_mara.errors import GymMaraError, unknown
 
 POLICIES = ("last", "best")
@@ -96,7 +97,12 @@ class RunFolder:
         try:
             values = json.loads(file.read_text())
             values.pop("versions")
-            return cls(path, RunConfig(**values))
+            config = RunConfig(**values)
+            for name in ("steps", "seed", "checkpoint_every"):
+                if type(values[name]) is not int:
+                    raise TypeError(f"{name} is {values[name]!r}")
+            Preset(**config.preset)
+            return cls(path, config)
         except (ValueError, KeyError, TypeError) as error:
             raise DamagedRunError(
                 f"the run folder {str(path)!r} is damaged: cannot read config.json ({error})"

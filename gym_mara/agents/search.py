@@ -21,7 +21,7 @@ from gym_mara.agents.evaluate import evaluate_run
 from gym_mara.agents.parallel import Say, run_tasks
 from gym_mara.agents.run import RunConfig
 from gym_mara.agents.train import train
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, TrainingDivergedError, unknown
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
@@ -58,6 +58,8 @@ SPACES: dict[str, dict[str, tuple[float, float] | list[Any]]] = {
 }
 
 
+_EVALUATIONS = 10
+"""How often a run is evaluated, and may be given up."""
 _OF_POLICY = ("log_std_init", "covariance_rate", "bias_rate", "widening")
 
 
@@ -87,7 +89,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         study_name="search",
         storage=JournalStorage(JournalFileBackend(str(folder / "study.log"))),
         sampler=optuna.samplers.TPESampler(multivariate=True, constant_liar=True),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=search.steps // 3),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=_EVALUATIONS // 3),
         load_if_exists=True,
     )
     about = {name: value for name, value in asdict(search).items() if name != "trials"}
@@ -159,14 +161,15 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
             chosen[name] = trial.suggest_float(name, *space, log=True)
     preset = with_values(presets.preset(search.algo, teleports=True), chosen)
     values: list[float] = []
-    last: list[float] = [math.nan]
+    told: list[int] = [0]
 
-    def report(steps: int, shown: dict[str, float]) -> None:
+    def report(_: int, shown: dict[str, float]) -> None:
         say(None)
-        evaluated = shown.get("eval_reward_per_step")
-        if evaluated is not None and evaluated != last[0] and not values:  # the first run decides
-            last[0] = evaluated
-            trial.report(_shortfall(evaluated), steps)
+        # By their number: the steps at which trials are evaluated hang on their rollouts.
+        number = int(shown.get("evaluations", 0))
+        if number > told[0] and not values:  # the first run decides
+            told[0] = number
+            trial.report(_shortfall(shown["eval_reward_per_step"]), number)
             if trial.should_prune():
                 raise optuna.TrialPruned
 
@@ -177,12 +180,12 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
             "pinocchio",
             search.steps,
             FIRST_SEED + 1000 * trial.number + seed,
-            checkpoint_every=search.steps // 10,
+            checkpoint_every=max(1, search.steps // _EVALUATIONS),
         )
         with TemporaryDirectory() as folder:
             try:
                 run = train(config, Path(folder) / "run", report, preset=preset)
-            except GymMaraError as error:  # it diverged
+            except TrainingDivergedError as error:
                 raise optuna.TrialPruned(str(error)) from error
             reward = float(evaluate_run(run, episodes=1)["reward_per_step"].mean())
         values.append(_shortfall(reward))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
@@ -20,6 +21,7 @@ from stable_baselines3.common.logger import (
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents import presets
 from gym_mara.agents.callbacks import (
@@ -29,10 +31,9 @@ from gym_mara.agents.callbacks import (
     restore_random_state,
 )
 from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.plot import plot_learning_curve
-from gym_mara.agents.policy import POLICY_CLASSES, algorithm_class, load_model, policy_arguments
+from gym_mara.agents.policy import algorithm_class, load_model, policy_arguments, policy_class
 from gym_mara.agents.run import DamagedRunError, RunConfig, RunFolder, read_progress
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 
 def train(
@@ -48,6 +49,7 @@ def train(
 
     Raises:
         GymMaraError: a name is unknown, a value out of range, or the folder exists.
+        TrainingDivergedError: the agent's numbers are no longer finite.
     """
     for name in ("steps", "checkpoint_every"):
         if getattr(config, name) < 1:
@@ -70,7 +72,8 @@ def resume(path: Path, report: Report) -> RunFolder:
     """Go on with a run from its last checkpoint, as if it had never been cut off.
 
     Raises:
-        GymMaraError: it is no run folder, it is damaged, or it has finished.
+        GymMaraError: it is no run folder, it is damaged, it has finished, or another process trains it.
+        TrainingDivergedError: the agent's numbers are no longer finite.
     """
     run = RunFolder.open(path)
     config = run.config
@@ -113,7 +116,7 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     arguments["policy_kwargs"] = policy_arguments(preset)
-    policy = POLICY_CLASSES[preset.policy]
+    policy = policy_class(preset)
     return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
 
 
@@ -147,19 +150,35 @@ def _learn(
     best: float = -np.inf,
     elapsed: float = 0.0,
 ) -> RunFolder:
-    model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
-    report(model.num_timesteps, {})
+    keeper = Keeper(run, best, elapsed, report)
     try:
-        model.learn(
-            run.config.steps - model.num_timesteps,
-            callback=Keeper(run, best, elapsed, report),
-            reset_num_timesteps=False,
-        )
+        with FileLock(
+            run.path / ".lock", timeout=0
+        ):  # the system frees it when the process is killed
+            model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
+            report(model.num_timesteps, {})
+            try:
+                left = run.config.steps - model.num_timesteps
+                model.learn(left, callback=keeper, reset_num_timesteps=False)
+            finally:
+                model.logger.close()
+    except Timeout:
+        raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
+    except ValueError as error:
+        if isinstance(error, TrainingDivergedError) or _is_finite(model):
+            raise
+        raise TrainingDivergedError(
+            f"the training diverged: the policy's parameters are no longer finite ({error}); "
+            "try a smaller learning rate or trust region"
+        ) from error
     finally:  # an interrupt among the ways out
-        model.logger.close()
+        keeper.close()
         base_env(model).close()
-    plot_learning_curve(run)
     return run
+
+
+def _is_finite(model: OnPolicyAlgorithm) -> bool:
+    return all(bool(parameter.isfinite().all()) for parameter in model.policy.parameters())
 
 
 def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
@@ -173,6 +192,11 @@ def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
         if row["time/total_timesteps"] <= steps:
             table.write(dict(row), {})
     kept.unlink(missing_ok=True)
+    folder = str(run.path / "tensorboard")
     if steps == 0:
-        shutil.rmtree(run.path / "tensorboard", ignore_errors=True)
-    return [table, TensorBoardOutputFormat(str(run.path / "tensorboard"))]
+        shutil.rmtree(folder, ignore_errors=True)
+    tensorboard = TensorBoardOutputFormat(folder)
+    if steps and tensorboard.writer is not None:
+        tensorboard.writer.close()  # type: ignore[no-untyped-call]
+        tensorboard.writer = SummaryWriter(folder, purge_step=steps + 1)  # type: ignore[no-untyped-call]
+    return [table, tensorboard]

@@ -59,8 +59,8 @@ def benchmark(
         from gym_mara.agents.figures import plot_grid
 
     grid = Grid(
-        envs=tuple(task_name(env) for env in envs.split(",")),
-        algos=tuple(algos.split(",")),
+        envs=tuple(task_name(env.strip()) for env in envs.split(",")),
+        algos=tuple(algo.strip() for algo in algos.split(",")),
         seeds=seeds,
         steps=whole("--steps", steps),
         preset_name=preset,
@@ -103,7 +103,9 @@ def search(
     env: EnvOption = "MARACollisionOrient-v0",
     algo: Annotated[str, typer.Option(help="Algorithm: ppo, trpo or acktr.")] = "ppo",
     steps: StepsOption = 1e6,
-    trials: Annotated[int, typer.Option(help="How many trials in all.")] = 40,
+    trials: Annotated[
+        int, typer.Option(help="How many trials in all, or a few more where several run at once.")
+    ] = 40,
     seeds: Annotated[int, typer.Option(help="How many runs make a trial.")] = 1,
     jobs: JobsOption = None,
     out_folder: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 import gym_mara  # noqa: F401 - registers the environments
-from gym_mara.agents.acktr import ACKTR
+from gym_mara.agents.acktr import ACKTR, LEAST_STD
 from gym_mara.agents.evaluate import make_env
 from gym_mara.errors import GymMaraError
 
@@ -143,7 +145,23 @@ def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Pa
     assert loaded.target_kl == model.target_kl
     for before, after in zip(_state(model), _state(loaded), strict=True):
         assert torch.equal(before, after)
-    loaded.learn(64, reset_num_timesteps=False)
+    env.training = False  # its statistics, which the two share, stay as they are
+    for learner in (model, loaded):
+        env.seed(1)
+        env.reset()
+        learner._last_obs = None
+        set_random_seed(2)
+        learner.learn(64, reset_num_timesteps=False)
+    for one, other in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_the_policy_never_narrows_below_what_float32_resolves() -> None:
+    model = ACKTR("MlpPolicy", "Pendulum-v1", n_steps=16, seed=0, device="cpu")
+    with torch.no_grad():
+        model.policy.log_std.fill_(math.log(LEAST_STD) - 1.0)
+    model.learn(16)
+    assert model.policy.log_std.min().item() == pytest.approx(math.log(LEAST_STD))
 
 
 def _state(model: ACKTR) -> list[torch.Tensor]:

@@ -150,6 +150,8 @@ def test_the_folder_of_another_grid_is_refused(
         ({"envs": ("MARA-v1",)}, "environment"),
         ({"algos": ("ppo2",)}, "algorithm"),
         ({"preset_name": "papers"}, "preset"),
+        ({"envs": ("MARA-v0", "MARA-v0")}, "name each once"),
+        ({"algos": ("ppo", "ppo")}, "name each once"),
         ({"seeds": 0}, "seeds"),
         ({"steps": -1}, "steps"),
     ],
@@ -162,7 +164,8 @@ def test_a_grid_of_nonsense_is_refused(
     assert not (tmp_path / "grid").exists()
 
 
-def test_figures_and_tables_show_every_run(finished_grid: Path) -> None:
+def test_figures_and_tables_show_every_run(finished_grid: Path, tmp_path: Path) -> None:
+    finished_grid = shutil.copytree(finished_grid, tmp_path / "grid")
     files = plot_grid(finished_grid)
     assert {file.name for file in files} == {
         "MARA-v0.png",
@@ -264,8 +267,10 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     file = tmp_path / "pid"
+    before = dict(os.environ)
     with pytest.raises(KeyboardInterrupt):
         run_tasks({"sleeping": partial(_sleeps, file)}, 1, interrupt)
+    assert dict(os.environ) == before
     with pytest.raises(ProcessLookupError):
         os.kill(int(file.read_text()), 0)
 

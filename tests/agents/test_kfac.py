@@ -188,6 +188,24 @@ def test_a_gradient_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
     assert not log_std.any()
 
 
+def test_units_through_which_nothing_flows_stay_as_they_are() -> None:
+    dead = nn.Linear(3, 4)
+    net = nn.Sequential(dead, nn.ReLU(), nn.Linear(4, 2))
+    with torch.no_grad():
+        dead.bias.fill_(-100.0)
+    before = [parameter.clone() for parameter in dead.parameters()]
+    kfac = KFAC(linear_layers(net), lr=0.1)
+    x, y = torch.randn(EXAMPLES, 3), torch.randn(EXAMPLES, 2)
+    for _ in range(3):
+        observe(kfac, net, x, y)
+        kfac.zero_grad()
+        (net(x) - y).square().mean().backward()  # type: ignore[no-untyped-call]
+        kfac.step()
+    for parameter, start in zip(dead.parameters(), before, strict=True):
+        assert torch.equal(parameter, start)
+    assert all(parameter.isfinite().all() for parameter in net.parameters())
+
+
 def test_predictions_that_are_not_finite_leave_the_factors_as_they_were() -> None:
     net = network(2, 1)
     kfac = KFAC(linear_layers(net))

@@ -13,7 +13,13 @@ from stable_baselines3.common.distributions import kl_divergence
 from torch.distributions import MultivariateNormal
 
 from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.natural_gaussian import LEAST_STD, NaturalGaussian, NaturalGaussianPolicy
+from gym_mara.agents.natural_gaussian import (
+    LEAST_STD,
+    WIDEST_STD,
+    NaturalGaussian,
+    NaturalGaussianPolicy,
+)
+from gym_mara.errors import GymMaraError
 
 
 @pytest.fixture
@@ -129,6 +135,29 @@ def test_the_policy_never_narrows_below_what_float32_resolves(model: PPO) -> Non
     policy.set_training_mode(True)
     sizes = torch.linalg.svdvals(policy.factor)
     torch.testing.assert_close(sizes, torch.full((6,), LEAST_STD))
+
+
+def test_the_widening_ends_at_half_of_an_actions_range() -> None:
+    env = make_env("MARAOrient-v0", "pinocchio", 4, {})
+    kwargs = {"widening": 1.0, "log_std_init": -1.0}
+    policy = PPO(NaturalGaussianPolicy, env, policy_kwargs=kwargs).policy
+    assert isinstance(policy, NaturalGaussianPolicy)
+    for update in range(30):  # each narrows one direction, and so widens all
+        policy(torch.as_tensor(env.reset()))
+        with torch.no_grad():
+            policy.log_scale[update % 6, update % 6] = -1.0
+        policy.set_training_mode(True)
+    sizes = torch.linalg.svdvals(policy.factor)
+    assert sizes.max() <= WIDEST_STD + 1e-6
+    assert sizes.min() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("env_id", "arguments"), [("CartPole-v1", {}), ("Pendulum-v1", {"use_sde": True})]
+)
+def test_what_the_policy_cannot_do_is_refused(env_id: str, arguments: dict[str, Any]) -> None:
+    with pytest.raises(GymMaraError, match="box actions"):
+        PPO(NaturalGaussianPolicy, env_id, device="cpu", **arguments)
 
 
 def test_what_the_reward_says_nothing_of_stays_wide() -> None:

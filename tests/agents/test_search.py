@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from filelock import FileLock
 
@@ -25,7 +26,7 @@ from gym_mara.agents.search import (
     work,
 )
 from gym_mara.agents.train import new_agent, train
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
 
@@ -73,13 +74,51 @@ def test_a_trial_that_diverges_does_not_end_the_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def diverge(*arguments: Any, **keywords: Any) -> None:
-        raise GymMaraError("the gradient is not finite")
+        raise TrainingDivergedError("the gradient is not finite")
 
     monkeypatch.setattr(module, "train", diverge)
     work(SMALL, tmp_path, deaf)
     study = open_study(SMALL, tmp_path)
     assert finished(study) == 2
     assert best(study) is None
+
+
+def test_what_is_wrong_with_every_trial_ends_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: Any, **keywords: Any) -> None:
+        raise GymMaraError("no space left on device")
+
+    monkeypatch.setattr(module, "train", full)
+    with pytest.raises(GymMaraError, match="no space left"):
+        work(SMALL, tmp_path, deaf)
+    assert finished(open_study(SMALL, tmp_path)) == 0
+
+
+def test_a_bad_trial_is_given_up_whatever_its_rollouts_length(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evaluations are compared by their number, not by the steps at which they happened to come."""
+    search = Search(**{**vars(SMALL), "trials": 12, "steps": 10_000})
+    played: list[int] = []
+
+    def pretend(config: Any, folder: Path, report: Any, *, preset: Any) -> str:
+        rollout = 7 * len(played) + 100  # no two alike
+        played.append(0)
+        reward = 9.0 if len(played) < 12 else -1.0
+        for number in range(1, 11):
+            shown = {"eval_reward_per_step": reward, "evaluations": number}
+            report(number * 1000 // rollout * rollout, shown)
+            report(number * 1000 // rollout * rollout + 1, shown)  # nothing new
+            played[-1] = number
+        return ""
+
+    monkeypatch.setattr(module, "train", pretend)
+    evaluated = {"reward_per_step": np.array([9.0])}
+    monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: evaluated)
+    work(search, tmp_path, deaf)
+    assert played[:11] == [10] * 11
+    assert played[11] < 10
 
 
 def test_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:

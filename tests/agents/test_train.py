@@ -11,19 +11,23 @@ import subprocess
 import sys
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from gym_mara.agents import presets
 from gym_mara.agents.evaluate import METRICS, evaluate_run, make_env, spread
 from gym_mara.agents.policy import load_policy
-from gym_mara.agents.run import RunFolder, read_progress
+from gym_mara.agents.run import DamagedRunError, RunFolder, read_progress
 from gym_mara.agents.train import resume, train
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import ROLLOUT, config, silent
 
 
@@ -206,7 +210,7 @@ def copy_of(run: RunFolder, path: Path) -> RunFolder:
 
 
 @pytest.mark.parametrize("file", ["model.zip", "normalisation.json"])
-@pytest.mark.parametrize("damage", ["missing", "empty", "cut"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a bit"])
 def test_a_damaged_policy_is_named(
     finished_run: RunFolder, tmp_path: Path, file: str, damage: str
 ) -> None:
@@ -214,10 +218,31 @@ def test_a_damaged_policy_is_named(
     victim = run.path / "last" / file
     content = victim.read_bytes()
     victim.unlink()
-    if damage != "missing":
+    gone = damage == "missing" and file == "model.zip"
+    if damage in ("empty", "cut"):
         victim.write_bytes(content[: 0 if damage == "empty" else len(content) // 2])
-    with pytest.raises(GymMaraError, match="run"):
+    elif damage == "a bit":
+        middle = len(content) // 2
+        flipped = bytes([content[middle] ^ 128])
+        victim.write_bytes(content[:middle] + flipped + content[middle + 1 :])
+    with pytest.raises(GymMaraError, match="has no 'last'" if gone else "damaged"):
         evaluate_run(run)
+
+
+@pytest.mark.parametrize("part", ["data", "policy.pth", "pytorch_variables.pth"])
+def test_a_checkpoint_with_a_flipped_bit_is_named(
+    finished_run: RunFolder, tmp_path: Path, part: str
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    file = run.checkpoints()[-1] / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        about = archive.getinfo(part)
+    content = bytearray(file.read_bytes())
+    content[about.header_offset + 60 + about.compress_size // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(DamagedRunError, match="damaged"):
+        resume(run.path, silent)
 
 
 def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
@@ -272,6 +297,55 @@ def test_a_policy_of_another_environment_is_refused(
     file.write_text(file.read_text().replace("MARACollisionOrient-v0", "MARA-v0"))
     with pytest.raises(GymMaraError, match="does not fit the environment"):
         evaluate_run(RunFolder.open(run.path))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"steps": "many"},
+        {"seed": 1.5},
+        {"preset": {}},
+        {"preset": {"num_envs": 1, "colour": "red"}},
+    ],
+)
+def test_a_configuration_of_another_form_is_named(
+    finished_run: RunFolder, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    values = json.loads((finished_run.path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(values | change))
+    with pytest.raises(DamagedRunError, match="damaged"):
+        RunFolder.open(tmp_path)
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(finished_run: RunFolder, tmp_path: Path) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    table = run.progress_file.read_bytes()
+    with FileLock(run.path / ".lock"), pytest.raises(GymMaraError, match="another process"):
+        resume(run.path, silent)
+    assert run.progress_file.read_bytes() == table
+    assert resume(run.path, silent).has_policy("last")
+
+
+def test_a_resumed_tensorboard_log_has_every_step_once(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    resume(run.path, silent)
+    log = EventAccumulator(str(run.path / "tensorboard"))
+    log.Reload()
+    steps = [event.step for event in log.Scalars("rollout/reward_per_step")]
+    assert steps == [ROLLOUT * (n + 1) for n in range(3)]
+
+
+def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
+    preset = presets.preset("ppo", teleports=True)
+    wild = replace(preset, arguments={**preset.arguments, "learning_rate": 1e30})
+    with pytest.raises(TrainingDivergedError, match="diverged"):
+        train(config(), tmp_path / "run", silent, preset=wild)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"env": "MARA-v0", "versions": {}}'])
