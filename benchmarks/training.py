@@ -57,9 +57,9 @@ class NothingVecEnv(VecEnv):
         return [False] * self.num_envs
 
 
-def training_ratio(task: str = "MARACollisionOrient-v0") -> str:
-    """Train both for 1M steps, slice by slice in turn, and say how the times compare."""
-    preset = presets.preset("ppo", teleports=True)
+def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
+    """Train both for 1M steps with PPO's preset of this name, slice by slice in turn, and say how the times compare."""
+    preset = presets.preset("ppo", name, teleports=True)
     ours = make_env(task, "pinocchio", preset.num_envs, {})
     models = [new_agent("ppo", preset, env, seed=0) for env in (ours, NothingVecEnv(ours))]
     seconds = [0.0, 0.0]
@@ -67,7 +67,7 @@ def training_ratio(task: str = "MARACollisionOrient-v0") -> str:
         for index, model in enumerate(models):
             seconds[index] += _learn(model, STEPS // SLICES)
     return (
-        f"{task}, {STEPS:,} steps: {seconds[0]:.1f} s; doing nothing: {seconds[1]:.1f} s; "
+        f"{task}, preset {name}, {STEPS:,} steps: {seconds[0]:.1f} s; doing nothing: {seconds[1]:.1f} s; "
         f"ratio {seconds[0] / seconds[1]:.2f}"
     )
 
@@ -78,15 +78,16 @@ def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
     return time.perf_counter() - start
 
 
-def update_costs(steps: int = 8) -> dict[str, float]:
-    """How long each algorithm's update takes on the same batch, 256 arms times `steps`, ms: the shortest of several turns."""
+def update_costs(batch: int = 2048) -> dict[str, float]:
+    """How long each algorithm's update takes on a batch of the same size, ms: the shortest of several turns."""
     models = {}
     for algo in ("ppo", "trpo", "acktr"):
         preset = presets.preset(algo, teleports=True)
+        steps = batch // preset.num_envs
         preset = replace(preset, arguments={**preset.arguments, "n_steps": steps})
         env = make_env("MARACollisionOrient-v0", "pinocchio", preset.num_envs, {})
         models[algo] = new_agent(algo, preset, env, seed=0)
-        models[algo].learn(preset.num_envs * steps)
+        models[algo].learn(batch)
     spent: dict[str, list[float]] = {algo: [] for algo in models}
     for _ in range(10):
         for algo, model in models.items():
@@ -99,7 +100,8 @@ def update_costs(steps: int = 8) -> dict[str, float]:
 def print_training() -> None:
     """Measure and print."""
     print("\n## Training, against the same PPO on an environment that does nothing\n")
-    print(training_ratio())
+    for name in ("tuned", "paper"):
+        print(training_ratio(name))
     print("\n## One update on the same batch of 2048 steps, tuned presets\n")
     costs = update_costs()
     print("| algorithm | ms | of PPO's |")

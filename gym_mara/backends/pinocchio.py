@@ -11,12 +11,19 @@ from numpy.typing import NDArray
 from gym_mara.backends.base import Backend
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import make_checker
+from gym_mara.robot.collision import (
+    CoalChecker,
+    ParallelCoalChecker,
+    RememberingChecker,
+    make_checker,
+)
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]
 
 
+# From so many arms on, to remember where there was room costs less than it spares.
+REMEMBER_FROM = 16
 # What a snapshot holds: the arms' configuration, velocity and time, and what they touch.
 _STATE = ("q", "qd", "time", "collided", "touching")
 
@@ -58,6 +65,12 @@ class PinocchioBackend(Backend):
             self.joint_velocity = np.full(robot.num_joints, velocity)
         self.path_resolution = positive_number("path_resolution", path_resolution, "m")
         self._checker = make_checker(collision, robot, collision_threads)
+        if (
+            self.teleports
+            and num_envs >= REMEMBER_FROM
+            and isinstance(self._checker, (CoalChecker, ParallelCoalChecker))
+        ):
+            self._checker = RememberingChecker(robot, self._checker)
         self._kinematics = robot.kinematics()
         self._q = np.tile(robot.home, (num_envs, 1))
         self._qd = np.zeros_like(self._q)

@@ -8,10 +8,16 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 import pytest
+from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import CollisionChecker, make_checker
+from gym_mara.robot.collision import (
+    CoalChecker,
+    CollisionChecker,
+    RememberingChecker,
+    make_checker,
+)
 from tests.helpers import COLLIDING_Q, COPIES, PATH_ENDS, TARGET_Q, Floats, robot_model, uniform_q
 
 ENGINES = ("coal", "coal in threads", "fcl")
@@ -119,6 +125,46 @@ def test_two_checkers_of_one_robot_do_not_disturb_each_other(mara: RobotModel) -
     for row in range(20):
         second.check(q[19 - row : 20 - row])
         assert first.check(q[row : row + 1])[0] == expected[row]
+
+
+@pytest.mark.parametrize("name", ["mara", "ur5"])
+def test_to_remember_where_there_was_room_changes_no_answer(name: str) -> None:
+    robot, exact = robot_model(name), _checker("coal", name)
+    assert isinstance(exact, CoalChecker)
+    checker = RememberingChecker(robot, CoalChecker(robot))
+    rng = np.random.default_rng(0)
+    centre, asked, hits = uniform_q(robot, 24, seed=1), 0, 0
+    checker._exact = SpiedChecker(robot)
+    for step in range(60):
+        if step % 20 == 0:  # some arms go elsewhere, among them to the edge of a collision
+            centre[:12] = uniform_q(robot, 12, seed=step)
+        scale = rng.choice([1e-3, 5e-3, 2e-2, 0.2], (24, 1))
+        q = np.clip(centre + scale * rng.standard_normal(centre.shape), robot.lower, robot.upper)
+        expected = exact.check(q)
+        np.testing.assert_array_equal(checker.check(q), expected)
+        asked, hits = asked + len(q), hits + int(expected.sum())
+    assert 0 < hits < asked
+    assert checker._exact.asked < 0.9 * asked, "it spares something"
+
+
+class SpiedChecker(CoalChecker):
+    """Counts what it is asked."""
+
+    asked = 0
+
+    def check(self, q: Floats) -> NDArray[np.bool_]:
+        self.asked += len(q)
+        return super().check(q)
+
+
+def test_arms_that_stay_with_room_around_them_are_not_checked(mara: RobotModel) -> None:
+    spied = SpiedChecker(mara)
+    checker = RememberingChecker(mara, spied)
+    q = np.tile(TARGET_Q, (16, 1))
+    for step in range(20):
+        assert not checker.check(q + 1e-4 * step).any()
+    assert spied.asked == 2 * 16, "once to get there, once to see that they stay"
+    assert checker.check(np.tile(COLLIDING_Q, (16, 1))).all()
 
 
 def test_none_finds_no_collision(mara: RobotModel) -> None:
