@@ -24,7 +24,7 @@ from training import print_training
 
 import gym_mara
 from gym_mara.robot import RobotModel
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import PAPER_TASKS
 
 BLIND = "MARA-v0, collision='none'"
 NUM_ENVS = (1, 16, 256, 1024)
@@ -129,7 +129,7 @@ def print_throughput() -> None:
     print("\n## Steps per second, random actions\n")
     row(
         "environments",
-        *TASKS,
+        *PAPER_TASKS,
         BLIND,
         "kinematics floor",
         "with collisions",
@@ -137,10 +137,10 @@ def print_throughput() -> None:
         "without collisions / floor",
         "MARACollisionOrient / floor",
     )
-    row(*["---"] * (len(TASKS) + 7))
+    row(*["---"] * (len(PAPER_TASKS) + 7))
     for num_envs in NUM_ENVS:
         q = configurations(num_envs)
-        functions = {name: batch(f"gym_mara/{name}", num_envs) for name in TASKS}
+        functions = {name: batch(f"gym_mara/{name}", num_envs) for name in PAPER_TASKS}
         functions[BLIND] = batch("gym_mara/MARA-v0", num_envs, collision="none")
         measured = rates(
             {**functions, "kinematics": kinematics_floor(q), "collisions": collision_floor(q)}

@@ -14,3 +14,9 @@ for _name in TASKS:
         kwargs={"task": _name},
         max_episode_steps=2048,
     )
+
+register(
+    id="gym_mara/MARAGoal-v0",
+    entry_point="gym_mara.goal_env:MaraGoalEnv",
+    max_episode_steps=50,
+)

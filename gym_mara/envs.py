@@ -214,7 +214,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 )
         chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
         self._ended[chosen] = False
-        if self.simulation.backend.random:
+        if self.simulation.random:
             self._seed(seeds, chosen)
         observation = self.simulation.reset(self._generators, mask)
         return observation, _vector_info(self.simulation.backend.report(), chosen)

@@ -17,6 +17,7 @@ from gym_mara.backends import backend_settings, make_backend
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import touching_links
+from gym_mara.robot.reachability import FreePoses
 from gym_mara.state import SimState, View
 from gym_mara.statistics import EpisodeStatistics
 from gym_mara.tasks import Goal, Task, make_task
@@ -74,6 +75,9 @@ class Simulation:
         known = [*(field.name for field in dataclasses.fields(self.task)), *others]
         self.backend = make_backend(backend, self.robot, self.num_envs, self._settings, known)
         self.backend_name = backend
+        self.random = self.backend.random or self.task.random_goal
+        """Whether episodes differ, so that `reset` wants generators."""
+        self._poses = FreePoses(self.robot) if self.task.random_goal else None
         self.goal = self.task.goal(self.robot, self.num_envs)
         start = self.robot.home if self.task.start_q is None else self.task.start_q
         self._start = np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1))
@@ -109,6 +113,12 @@ class Simulation:
                 seeds[index] = generators[index].integers(2**63)
                 self._noise[index] = np.random.default_rng(seeds[index])
             self.backend.begin_episodes(seeds, chosen)
+        if self._poses is not None:
+            position, quaternion = self.goal.position.copy(), self.goal.quaternion.copy()
+            for index in np.flatnonzero(chosen).tolist():
+                drawn = self.task.draw_goal(self._poses, generators[index])
+                position[index], quaternion[index] = drawn
+            self.goal = Goal(position, quaternion)
         self.backend.reset(self._start, mask)
         self.statistics.clear(slice(None) if mask is None else mask)
         self._started = True
@@ -224,6 +234,7 @@ class Simulation:
             "statistics": copy.deepcopy(self.statistics),
             "noise": copy.deepcopy(self._noise),
             "started": self._started,
+            "goal": (self.goal.position, self.goal.quaternion),
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -234,6 +245,7 @@ class Simulation:
         self._noise = copy.deepcopy(snapshot["noise"])
         self._started = snapshot["started"]
         self._seen = None
+        self.goal = Goal(*(values.copy() for values in snapshot["goal"]))
 
     def close(self) -> None:
         """Free the backend; closing twice does no harm."""

@@ -22,7 +22,7 @@ from gym_mara.cli.common import (
     whole,
 )
 from gym_mara.errors import GymMaraError, whole_number
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
     from gym_mara.agents.benchmark import Grid
@@ -35,7 +35,7 @@ JobsOption = Annotated[
 
 def benchmark(
     envs: Annotated[str, typer.Option(help="Environments, with commas between them.")] = ",".join(
-        TASKS
+        PAPER_TASKS
     ),
     algos: Annotated[
         str, typer.Option(help="Algorithms, with commas between them.")

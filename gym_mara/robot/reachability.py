@@ -6,10 +6,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from gym_mara.robot.collision import make_checker
+from gym_mara.errors import GymMaraError
+from gym_mara.robot.collision import CoalChecker, make_checker
 from gym_mara.robot.model import RobotModel
 
 Floats = NDArray[np.float64]
+_TRIES = 10_000
 
 
 def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
@@ -72,6 +74,36 @@ def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tupl
     w, x, y, z = quaternion
     turn = pin.Quaternion(w, x, y, z).normalized().matrix() @ here.rotation.T
     return distance, float(np.linalg.norm(pin.log3(turn)))
+
+
+class FreePoses:
+    """Draws end-effector poses that the arm has at collision-free configurations.
+
+    Args:
+        robot: the arm.
+    """
+
+    def __init__(self, robot: RobotModel) -> None:
+        self._robot = robot
+        self._checker = CoalChecker(robot)
+        self._kinematics = robot.kinematics()
+        self._low = np.maximum(robot.lower, -np.pi)
+        self._high = np.minimum(robot.upper, np.pi)
+
+    def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+        """Position (3,), m, and quaternion (4,), [w, x, y, z], at a configuration drawn evenly from all that are free.
+
+        Raises:
+            GymMaraError: nearly every configuration of the robot collides.
+        """
+        for _ in range(_TRIES):
+            q = generator.uniform(self._low, self._high)[None]
+            if not self._checker.check(q)[0]:
+                position, quaternion = self._kinematics.pose(q)
+                return position[0], quaternion[0]
+        raise GymMaraError(
+            f"{self._robot.name} collides at {_TRIES} random configurations of as many"
+        )
 
 
 def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:

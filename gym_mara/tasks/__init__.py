@@ -7,16 +7,20 @@ from typing import Any
 
 from gym_mara.errors import unknown
 from gym_mara.tasks.base import Goal, Task
+from gym_mara.tasks.random_reach import RandomReachTask
 from gym_mara.tasks.reach import ReachTask
 
-__all__ = ["TASKS", "Goal", "ReachTask", "Task", "make_task"]
+__all__ = ["PAPER_TASKS", "TASKS", "Goal", "ReachTask", "Task", "make_task"]
 
 TASKS: dict[str, Task] = {
     "MARA-v0": ReachTask(),
     "MARAOrient-v0": ReachTask(orientation=True),
     "MARACollision-v0": ReachTask(collision_penalty=True),
     "MARACollisionOrient-v0": ReachTask(orientation=True, collision_penalty=True),
+    "MARARandomTarget-v0": RandomReachTask(),
 }
+PAPER_TASKS = tuple(TASKS)[:4]
+"""The four environments of ROS2Learn."""
 
 
 def make_task(task: str | Task, options: dict[str, Any]) -> tuple[Task, dict[str, Any]]:

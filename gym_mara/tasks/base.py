@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from gym_mara import rotations
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
+from gym_mara.robot.reachability import FreePoses
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]
@@ -49,6 +51,9 @@ class Task(ABC):
         GymMaraError: a value is of the wrong form or out of its range.
     """
 
+    random_goal: ClassVar[bool] = False
+    """Whether each episode has a goal of its own, from `draw_goal`."""
+
     on_collision: str = "reset"
     """What follows a collision: "reset" (back to the start pose, the episode goes on), "terminate" or "continue"."""
     start_q: tuple[float, ...] | None = None
@@ -76,6 +81,15 @@ class Task(ABC):
     @abstractmethod
     def goal(self, robot: RobotModel, num_envs: int) -> Goal:
         """The goal of each arm."""
+
+    def draw_goal(self, poses: FreePoses, generator: np.random.Generator) -> tuple[Floats, Floats]:
+        """A goal for one episode: position (3,), m, and quaternion (4,) [w, x, y, z]; asked for where `random_goal` is set.
+
+        Args:
+            poses: draws poses within the arm's reach.
+            generator: the episode's source of randomness.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def observation_space(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Box:

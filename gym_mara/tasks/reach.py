@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
+from numpy.typing import NDArray
 
 from gym_mara import rotations
 from gym_mara.errors import GymMaraError, positive_number
@@ -112,16 +113,22 @@ class ReachTask(Task):
         `position_error` (m, Euclidean), `angle_error` (rad), and `reward_distance`, `reward_orientation`,
         `reward_collision`.
         """
-        error = state.ee_position - goal.position
+        return self.judge(state.ee_position, state.ee_quaternion, state.collided, goal)
+
+    def judge(
+        self, position: Floats, quaternion: Floats, collided: NDArray[np.bool_], goal: Goal
+    ) -> tuple[Floats, dict[str, Floats]]:
+        """The reward of tools at a position (N, 3), m, and a quaternion (N, 4), and its terms, as `reward` has them."""
+        error = position - goal.position
         position_error = np.sqrt(np.vecdot(error, error))
         distance = position_error * _RMS
-        angle = rotations.angle_between(state.ee_quaternion, goal.quaternion)
+        angle = rotations.angle_between(quaternion, goal.quaternion)
         near = rewards.distance_reward(distance, self.alpha, self.kappa)
         aligned = collision = None
         if self.orientation:
             aligned = rewards.orientation_factor(angle, self.beta, self.gamma)
         if self.collision_penalty:
-            collision = rewards.collision_penalty(state.collided, distance, self.delta, self.eta)
+            collision = rewards.collision_penalty(collided, distance, self.delta, self.eta)
         total = (near if aligned is None else near * aligned) - _ONE
         if collision is not None:
             total -= collision

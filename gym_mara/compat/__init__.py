@@ -1,0 +1,1 @@
+"""Forms that other packages gave these environments."""

@@ -1,0 +1,153 @@
+"""MaraGoalEnv: the arm in the form of Gymnasium-Robotics' goal environments, for algorithms such as hindsight replay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict
+from numpy.typing import NDArray
+
+from gym_mara import rotations
+from gym_mara.envs import MaraEnv
+from gym_mara.errors import GymMaraError, positive_number, unknown
+from gym_mara.tasks import Goal, ReachTask, Task
+
+Floats = NDArray[np.float64]
+REWARD_TYPES = ("sparse", "dense")
+
+
+class MaraGoalEnv(MaraEnv):
+    """One arm whose goal can be exchanged afterwards.
+
+    The observation is a dictionary: `observation`, joint positions (J,), rad, and the tool's velocity (3,), m/s;
+    `achieved_goal` and `desired_goal`, the tool's and the target's position (3,), m, followed by their quaternions (4,),
+    [w, x, y, z], where the orientation counts. `info` also has `is_success`.
+
+    Args:
+        task: the name of a reach task, or a ReachTask.
+        reward_type: "sparse": 0 within the tolerances, else -1; or "dense": the task's reward.
+        position_tolerance: m.
+        angle_tolerance: rad; it counts where the orientation does.
+        **options: as of MaraEnv.
+
+    Raises:
+        GymMaraError: a name is unknown, a value is out of its range, or the task is no reach task.
+    """
+
+    def __init__(
+        self,
+        task: str | Task = "MARARandomTarget-v0",
+        *,
+        reward_type: str = "sparse",
+        position_tolerance: float = 0.02,
+        angle_tolerance: float = 0.1,
+        **options: Any,
+    ) -> None:
+        if reward_type not in REWARD_TYPES:
+            raise unknown("reward_type", reward_type, REWARD_TYPES)
+        self.reward_type = reward_type
+        self.position_tolerance = positive_number("position_tolerance", position_tolerance, "m")
+        self.angle_tolerance = positive_number("angle_tolerance", angle_tolerance, "rad")
+        super().__init__(task, **options)
+        if not isinstance(self.simulation.task, ReachTask):
+            raise GymMaraError(f"a goal environment wants a reach task, not {task!r}")
+        self.task = self.simulation.task
+        joints = self.simulation.robot.num_joints
+        after_errors = joints + (7 if self.task.orientation else 3)
+        self._own = np.r_[0:joints, after_errors : after_errors + 3]
+        flat = self.simulation.observation_space
+        own = Box(flat.low[self._own], flat.high[self._own], dtype=np.float64)
+        extent, one = self.simulation.robot.extent, 1.0 + 1e-9
+        low, high = [-extent] * 3, [extent] * 3
+        if self.task.orientation:
+            low, high = [*low, 0.0, *[-one] * 3], [*high, *[one] * 4]
+        goal = Box(np.array(low), np.array(high), dtype=np.float64)
+        self.observation_space = Dict(observation=own, achieved_goal=goal, desired_goal=goal)  # type: ignore[assignment]
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Floats], dict[str, Any]]:
+        """Begin an episode at the start pose."""
+        observation, info = super().reset(seed=seed, options=options)
+        return self._as_goals(observation), info
+
+    def step(  # type: ignore[override]
+        self, action: NDArray[np.float32]
+    ) -> tuple[dict[str, Floats], float, bool, bool, dict[str, Any]]:
+        """Move towards the joint targets (J,), rad, for one control period.
+
+        Raises:
+            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
+        """
+        flat, _, terminated, truncated, info = super().step(action)
+        observation = self._as_goals(flat)
+        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        info["is_success"] = bool(self._succeeds(achieved, desired))
+        reward = float(self.compute_reward(achieved, desired, info))
+        return observation, reward, terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
+        """The rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+
+        Args:
+            achieved_goal: where the tool is.
+            desired_goal: where it was to be.
+            info: a step's, or a sequence of as many; the task's collision penalty reads `collided` there.
+
+        Raises:
+            GymMaraError: the reward wants to know of collisions, and the info does not say.
+        """
+        if self.reward_type == "sparse":
+            return self._succeeds(achieved_goal, desired_goal) - 1.0
+        achieved, desired = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
+        collided = np.zeros(len(achieved), np.bool_)
+        if self.task.collision_penalty:
+            infos = [info] if isinstance(info, Mapping) else list(info)
+            if not all("collided" in one for one in infos):
+                raise GymMaraError(
+                    "the collision penalty needs each step's info: HerReplayBuffer(copy_info_dict=True)"
+                )
+            collided = np.array([one["collided"] for one in infos])
+        position, quaternion = self._parts(achieved)
+        reward, _ = self.task.judge(position, quaternion, collided, Goal(*self._parts(desired)))
+        return reward.reshape(np.shape(achieved_goal)[:-1])
+
+    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
+        """Never: an episode goes on at its goal."""
+        return False
+
+    def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
+        """Never by the goal."""
+        return False
+
+    def _succeeds(self, achieved: Floats, desired: Floats) -> Any:
+        away = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
+        near = away <= self.position_tolerance
+        if self.task.orientation:
+            angle = rotations.angle_between(achieved[..., 3:], desired[..., 3:])
+            near &= angle <= self.angle_tolerance
+        return near
+
+    def _parts(self, goal: Floats) -> tuple[Floats, Floats]:
+        """Positions (N, 3) and quaternions (N, 4) of goals (N, G)."""
+        if self.task.orientation:
+            return goal[:, :3], goal[:, 3:]
+        return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
+
+    def _as_goals(self, flat: Floats) -> dict[str, Floats]:
+        """The task's observation (O,) as one with goals."""
+        joints = self.simulation.robot.num_joints
+        goal = self.simulation.goal
+        achieved = [flat[joints : joints + 3] + goal.position[0]]
+        desired = [goal.position[0]]
+        if self.task.orientation:
+            error = flat[joints + 3 : joints + 7]
+            achieved.append(rotations.canonical(rotations.multiply(error, goal.quaternion[0])))
+            desired.append(goal.quaternion[0])
+        return {
+            "observation": flat[self._own],
+            "achieved_goal": np.concatenate(achieved),
+            "desired_goal": np.concatenate(desired),
+        }

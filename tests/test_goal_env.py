@@ -1,0 +1,184 @@
+"""Targets that are drawn, and goals that can be exchanged afterwards."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.errors import GymMaraError
+from gym_mara.goal_env import MaraGoalEnv
+from gym_mara.robot.reachability import miss
+from tests.helpers import COLLIDING_Q, COPIES, TARGET_Q, robot_model
+
+RANDOM = "MARARandomTarget-v0"
+ORIENT: dict[str, Any] = {"orientation": True}
+
+
+def test_each_episode_has_a_target_of_its_own_within_reach() -> None:
+    env = MaraEnv(RANDOM, **ORIENT)
+    targets = [env.reset(seed=0)[0][-7:], *(env.reset()[0][-7:] for _ in range(4))]
+    assert len({tuple(target) for target in targets}) == 5
+    for target in targets:
+        distance, angle = miss(robot_model("mara"), target[:3], target[3:])
+        assert distance < 1e-6
+        assert angle < 1e-6
+
+
+def test_the_target_stays_during_an_episode_and_is_what_is_rewarded() -> None:
+    env = MaraEnv(RANDOM)
+    target = env.reset(seed=1)[0][-3:]
+    for q in (
+        TARGET_Q,
+        COLLIDING_Q,
+        TARGET_Q,
+    ):  # a collision puts the arm back, and leaves the target
+        observation, _, _, _, info = env.step(np.array(q, np.float32))
+        np.testing.assert_array_equal(observation[-3:], target)
+        assert info["position_error"] == pytest.approx(np.linalg.norm(observation[6:9]))
+        assert env.observation_space.contains(observation)
+
+
+def test_a_seed_repeats_its_targets() -> None:
+    def targets(seed: int) -> list[Any]:
+        env = MaraEnv(RANDOM)
+        return [env.reset(seed=seed)[0].tolist(), env.reset()[0].tolist()]
+
+    assert targets(5) == targets(5)
+    assert targets(5) != targets(6)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_vector_environment_has_the_targets_of_single_ones(mode: str) -> None:
+    envs = MaraVectorEnv(3, RANDOM, max_episode_steps=2, autoreset_mode=mode)
+    singles = [MaraEnv(RANDOM) for _ in range(3)]
+    observation, _ = envs.reset(seed=7)
+    expected = [env.reset(seed=7 + index)[0] for index, env in enumerate(singles)]
+    np.testing.assert_array_equal(observation, expected)
+    for _ in range(2 if mode == "SameStep" else 3):
+        observation = envs.step(np.zeros((3, 6)))[0]
+    expected = [env.reset()[0] for env in singles]
+    np.testing.assert_array_equal(observation, expected)
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_a_copy_keeps_its_target(copy: Any) -> None:
+    env = MaraEnv(RANDOM)
+    env.reset(seed=2)
+    copied = copy(env)
+    np.testing.assert_array_equal(
+        copied.step(np.zeros(6, np.float32))[0], env.step(np.zeros(6, np.float32))[0]
+    )
+    snapshot = env.save_state()
+    first = env.reset()[0]
+    env.restore_state(snapshot)
+    np.testing.assert_array_equal(env.reset()[0], first)
+
+
+def test_a_target_of_ones_own_is_refused() -> None:
+    with pytest.raises(GymMaraError, match="draws its targets"):
+        MaraEnv(RANDOM, target_position=(0.0, 0.3, 1.0))
+
+
+@pytest.mark.filterwarnings("ignore:.*action space", "ignore:.*symmetric")  # one's own to rescale
+@pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
+@pytest.mark.parametrize("options", [{}, ORIENT, {"reward_type": "dense"}])
+def test_the_checkers_accept_the_goal_environment(check: Any, options: dict[str, Any]) -> None:
+    env: Any = gymnasium.make("gym_mara/MARAGoal-v0", **options)
+    check(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+OPTIONS: list[dict[str, Any]] = [
+    {},
+    {"reward_type": "dense"},
+    {"reward_type": "dense", **ORIENT, "collision_penalty": True},
+    {"reward_type": "sparse", **ORIENT},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+@given(data=st.data())
+def test_rewards_computed_afterwards_are_those_that_were_given(
+    options: dict[str, Any], data: st.DataObject
+) -> None:
+    env = MaraGoalEnv(**options)
+    env.reset(seed=data.draw(st.integers(0, 1000)))
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    steps = [env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32)) for _ in range(4)]
+    achieved, desired = (
+        np.array([step[0][key] for step in steps]) for key in ("achieved_goal", "desired_goal")
+    )
+    given_ = [step[1] for step in steps]
+    infos = np.array([step[4] for step in steps], dtype=object)
+    np.testing.assert_allclose(
+        env.compute_reward(achieved, desired, infos), given_, rtol=0.0, atol=1e-9
+    )
+    one = env.compute_reward(achieved[0], desired[0], infos[0])
+    assert one == pytest.approx(given_[0], abs=1e-9)
+
+
+def test_a_goal_that_is_reached_is_a_success() -> None:
+    env = MaraGoalEnv("MARAOrient-v0")
+    env.reset()
+    observation, reward, *_, info = env.step(np.array(TARGET_Q, np.float32))
+    assert reward == 0.0
+    assert info["is_success"]
+    turned = observation["desired_goal"].copy()
+    turned[3:] = (1.0, 0.0, 0.0, 0.0)
+    assert env.compute_reward(observation["achieved_goal"], turned, info) == -1.0
+    elsewhere = env.step(np.zeros(6, np.float32))
+    assert elsewhere[1] == -1.0
+    assert not elsewhere[4]["is_success"]
+
+
+def test_hindsight_replay_learns_from_goals_that_were_not_meant() -> None:
+    env = gymnasium.wrappers.RescaleAction(
+        gymnasium.make("gym_mara/MARAGoal-v0", max_episode_steps=10),
+        np.float32(-1),
+        np.float32(1),
+    )
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "copy_info_dict": True},
+        learning_starts=100,
+        policy_kwargs={"net_arch": [16]},
+        seed=0,
+        device="cpu",
+    )
+    model.learn(300)
+    assert isinstance(model.replay_buffer, HerReplayBuffer)
+    rewards = model.replay_buffer.sample(256).rewards
+    assert rewards.max() == 0.0, "successes in hindsight"
+    assert model.replay_buffer.rewards.max() <= 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"reward_type": "shaped"}, "unknown reward_type"),
+        ({"position_tolerance": 0.0}, "position_tolerance"),
+        ({"angle_tolerance": np.nan}, "angle_tolerance"),
+        ({"alfa": 1.0}, "Did you mean 'alpha'"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(GymMaraError, match=told):
+        MaraGoalEnv(**options)
+
+
+def test_a_penalty_without_infos_is_told() -> None:
+    env = MaraGoalEnv(reward_type="dense", collision_penalty=True)
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(GymMaraError, match="copy_info_dict"):
+        env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
