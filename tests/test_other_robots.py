@@ -1,0 +1,42 @@
+"""Other arms: every task, on every backend, drawn too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gym_mara.backends import backend_names
+from gym_mara.envs import MaraEnv
+from gym_mara.tasks import TASKS
+from tests.helpers import robot_model
+
+ARMS = ("ur5", "ur10", "panda", "so100", "talos_arm")
+
+
+@pytest.mark.parametrize("backend", backend_names())
+@pytest.mark.parametrize("arm", ARMS)
+def test_an_arm_runs_every_task_and_shows_itself(arm: str, backend: str) -> None:
+    rng = np.random.default_rng(0)
+    for task in TASKS:
+        draws = task == "MARACollisionOrient-v0"
+        env = MaraEnv(
+            task,
+            robot=robot_model(arm),
+            backend=backend,
+            render_mode="rgb_array" if draws else None,
+            renderer="raycast",
+            width=160,
+            height=120,
+        )
+        env.reset(seed=0)
+        for _ in range(5):
+            action = rng.uniform(-1.0, 1.0, env.action_space.shape or ()).astype(np.float32)
+            observation, reward, *_ = env.step(action)
+            assert env.observation_space.contains(observation)
+            assert np.isfinite(reward)
+        if draws:
+            picture = env.render()
+            assert picture is not None
+            off_background = np.abs(picture.astype(int) - picture[0, 0]).max(axis=-1) > 60
+            assert off_background.mean() > 0.01, "the arm"
+        env.close()
