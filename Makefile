@@ -12,7 +12,7 @@ demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under ru
 
 test: $(READY) ## Run the tests, some of them in Chromium.
 	.ci/chromium
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto $(TESTS)
 
 lint: $(READY) ## Check format, lint and types.
 	$(BIN)/ruff format --check .
@@ -27,8 +27,8 @@ bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some
 experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
 	$(BIN)/gym-mara benchmark --out runs/experiment
 
-test-oldest: ## Run the tests with the oldest Gymnasium that is supported.
-	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt
+test-oldest: ## Run the tests of all that Gymnasium calls, with the oldest that is supported.
+	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt TESTS="$(GYMNASIUM_TESTS)"
 
 test-wheel: ## Build the wheel, install it away from the checkout, and use every environment from there.
 	.ci/test-wheel $(PYTHON)
@@ -37,6 +37,8 @@ clean: ## Remove the virtual environments and what the tools left.
 	rm -rf .venv .venv-oldest build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt
+TESTS ?=
+GYMNASIUM_TESTS = $(wildcard tests/test_*.py) tests/rendering/test_pictures.py $(addprefix tests/agents/test_,sb3.py train.py)
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
