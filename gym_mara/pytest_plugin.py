@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.register_assert_rewrite("gym_mara.testing")
+
 
 @pytest.fixture
 def check_rewards() -> Callable[..., None]:

@@ -14,7 +14,8 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from gym_mara.backends.dart import DartBackend, SimulationDivergedError
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
-from tests.helpers import COLLIDING_Q, COPIES, ENV_IDS
+from gym_mara.testing import COLLIDING_Q, COPIES
+from tests.helpers import ENV_IDS
 
 RANGES = {
     "mass": (0.8, 1.2),

@@ -22,16 +22,14 @@ from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.tasks import ReachTask
+from gym_mara.testing import COLLIDING_Q, COPIES, pickled
 from tests.backends.fake import FakeBackend
 from tests.helpers import (
-    COLLIDING_Q,
-    COPIES,
     ENV_IDS,
     PATH_ENDS,
     TARGET_Q,
     TASK_NAMES,
     joint_xml,
-    pickled,
     robot_model,
     urdf_xml,
     write,

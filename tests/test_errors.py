@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gym_mara.errors import GymMaraError, MissingExtraError, unknown
-from tests.helpers import pickled
+from gym_mara.testing import pickled
 
 
 def test_unknown_names_the_nearest_and_all_valid_names_in_order() -> None:

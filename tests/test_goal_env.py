@@ -17,7 +17,8 @@ from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.goal_env import MaraGoalEnv
 from gym_mara.robot.reachability import miss
-from tests.helpers import COLLIDING_Q, COPIES, TARGET_Q, robot_model
+from gym_mara.testing import COLLIDING_Q, COPIES
+from tests.helpers import TARGET_Q, robot_model
 
 RANDOM = "MARARandomTarget-v0"
 ORIENT: dict[str, Any] = {"orientation": True}

@@ -11,7 +11,8 @@ import pytest
 from gymnasium.vector import VectorEnv
 
 from gym_mara.statistics import EpisodeStatistics
-from tests.helpers import COPIES, Floats
+from gym_mara.testing import COPIES
+from tests.helpers import Floats
 
 STEPS = 7
 NAMES = {

@@ -16,7 +16,8 @@ from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.statistics import EpisodeStatistics
-from tests.helpers import COLLIDING_Q, COPIES, ENV_IDS, TASK_NAMES, Floats, pickled
+from gym_mara.testing import COLLIDING_Q, COPIES, pickled
+from tests.helpers import ENV_IDS, TASK_NAMES, Floats
 
 MODES = ("NextStep", "SameStep")
 ON_COLLISION = ("reset", "terminate", "continue")

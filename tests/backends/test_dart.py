@@ -14,7 +14,8 @@ from gym_mara.backends.dart_arm import DETECTORS, DartArm
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import approach_bounds, make_checker
-from tests.helpers import COLLIDING_Q, Floats, robot_model, uniform_q
+from gym_mara.testing import COLLIDING_Q, uniform_q
+from tests.helpers import Floats, robot_model
 
 # In reach without touching anything on the way from home.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])

@@ -13,7 +13,8 @@ from gym_mara.backends.pinocchio import PinocchioBackend
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import make_checker
-from tests.helpers import COLLIDING_Q, PATH_ENDS, Floats, robot_model, uniform_q
+from gym_mara.testing import COLLIDING_Q, uniform_q
+from tests.helpers import PATH_ENDS, Floats, robot_model
 
 VELOCITY, PERIOD = 0.5, 0.02
 TRAVEL = VELOCITY * PERIOD

@@ -14,7 +14,7 @@ from gym_mara.backends.dart import SimulationDivergedError
 from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from tests.helpers import assert_same_state, uniform_q
+from gym_mara.testing import assert_same_state, uniform_q
 
 RANDOM = {"mass": (0.8, 1.2), "servo_gain": (0.7, 1.3), "latency": (0.0, 0.05)}
 

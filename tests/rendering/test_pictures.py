@@ -23,7 +23,8 @@ from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering import CAMERAS, RENDERERS
 from gym_mara.rendering.look import VIEW_ANGLE
-from tests.helpers import COLLIDING_Q, COPIES, TARGET_Q
+from gym_mara.testing import COLLIDING_Q, COPIES
+from tests.helpers import TARGET_Q
 
 Picture = NDArray[np.uint8]
 

@@ -17,8 +17,8 @@ from playwright.sync_api import Browser, Page
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.rendering.look import VIEW_ANGLE
+from gym_mara.testing import COLLIDING_Q, pickled
 from tests.browser import chromium
-from tests.helpers import COLLIDING_Q, pickled
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser's server
 ACTION = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], np.float32)

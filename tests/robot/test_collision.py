@@ -18,7 +18,8 @@ from gym_mara.robot.collision import (
     RememberingChecker,
     make_checker,
 )
-from tests.helpers import COLLIDING_Q, COPIES, PATH_ENDS, TARGET_Q, Floats, robot_model, uniform_q
+from gym_mara.testing import COLLIDING_Q, COPIES, uniform_q
+from tests.helpers import PATH_ENDS, TARGET_Q, Floats, robot_model
 
 ENGINES = ("coal", "coal in threads", "fcl")
 CONTACT = 1e-4

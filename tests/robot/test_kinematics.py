@@ -13,17 +13,8 @@ import pytest
 from gym_mara.robot import RobotModel
 from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.kinematics import Kinematics
-from tests.helpers import (
-    COPIES,
-    Floats,
-    golden,
-    golden_q,
-    joint_xml,
-    robot_model,
-    uniform_q,
-    urdf_xml,
-    write,
-)
+from gym_mara.testing import COPIES, uniform_q
+from tests.helpers import Floats, golden, golden_q, joint_xml, robot_model, urdf_xml, write
 
 
 def _assert_agrees_with_pinocchio(robot: RobotModel, count: int) -> None:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from tests.helpers import COPIES, joint_xml, robot_model, uniform_q, urdf_xml, write
+from gym_mara.testing import COPIES, uniform_q
+from tests.helpers import joint_xml, robot_model, urdf_xml, write
 
 
 def _load(tmp_path: Path, text: str, ee_frame: str | None = "link2") -> RobotModel:

@@ -9,7 +9,8 @@ from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.collision import make_checker
 from gym_mara.robot.reachability import miss, reachable_pose, solve_ik
 from gym_mara.rotations import angle_between
-from tests.helpers import robot_model, uniform_q
+from gym_mara.testing import uniform_q
+from tests.helpers import robot_model
 
 
 @pytest.mark.parametrize("name", ["mara", "ur5", "panda"])

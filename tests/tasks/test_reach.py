@@ -17,16 +17,15 @@ from gym_mara.robot.reachability import solve_ik
 from gym_mara.rotations import canonical, conjugate, multiply
 from gym_mara.state import SimState
 from gym_mara.tasks import PAPER_TASKS, TASKS, ReachTask, Task, make_task
+from gym_mara.testing import arrays_of, uniform_q
 from tests.helpers import (
     TARGET_Q,
     TASK_NAMES,
     Floats,
-    arrays_of,
     golden,
     golden_q,
     joint_xml,
     robot_model,
-    uniform_q,
     urdf_xml,
     write,
 )
