@@ -24,9 +24,11 @@ from torch.distributions import MultivariateNormal
 from gym_mara.errors import GymMaraError
 
 # Standard deviations stay above this: much below it actions, which are float32 of order 1, no longer tell them apart.
+# ACKTR stops at ten times as much. Tuned trainings come down to either, so that another value is another result.
 LEAST_STD = 1e-6
-# The widening makes none wider than this, half of an action's range.
-WIDEST_STD = 1.0
+# The widening makes none wider than this, five times an action's range. It is there against overflow: where the reward
+# says nothing, as of the last joint without orientation, tuned trainings reach some four.
+WIDEST_STD = 10.0
 
 
 class NaturalGaussian(Distribution):
@@ -85,9 +87,10 @@ class NaturalGaussian(Distribution):
 class NaturalGaussianPolicy(ActorCriticPolicy):
     """Stable-Baselines3's actor and critic with a NaturalGaussian, for box actions.
 
-    Before each update the centre moves to the mean of the rollout's actions and the factor takes up what was learnt of
-    the covariance. This changes nothing of the policy but by `widening`: then the rollout was drawn from a policy that is
-    narrower by that, and the first ratios of an update differ from one by some hundredths.
+    Before each update the centre moves to the mean of the rollout's means and the factor takes up what was learnt of the
+    covariance. Without `widening` this does not change the policy. With it the policy, means and spread, is also scaled
+    about its old centre, so that the rollout was drawn from a narrower one, and the first ratios of an update differ from
+    one by some hundredths.
 
     The optimiser is plain gradient descent, torch's SGD: in these coordinates the plain gradient is the natural one. It
     wants learning rates of 0.005 to 0.1. An optimiser that gives every parameter steps of one size, such as Adam, makes
@@ -99,7 +102,7 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         bias_rate: how fast what is common to the means of all states is learnt, relative to how they differ.
         widening: an entropy bonus, for algorithms that have none as well. Where an update has narrowed the distribution
             by e^-x in the direction that it narrowed most, the distribution is widened by e^(widening x) in all. So
-            directions of which the reward says little stay wide. None becomes wider by it than a standard deviation of 1.
+            directions of which the reward says little stay wide. None becomes wider by it than a standard deviation of 10.
 
     Raises:
         GymMaraError: the actions are no box, or gSDE is asked for.

@@ -137,19 +137,47 @@ def test_the_policy_never_narrows_below_what_float32_resolves(model: PPO) -> Non
     torch.testing.assert_close(sizes, torch.full((6,), LEAST_STD))
 
 
-def test_the_widening_ends_at_half_of_an_actions_range() -> None:
+def _widening_policy(widening: float) -> tuple[NaturalGaussianPolicy, torch.Tensor]:
+    """A policy, and observations for it."""
     env = make_env("MARAOrient-v0", "pinocchio", 4, {})
-    kwargs = {"widening": 1.0, "log_std_init": -1.0}
-    policy = PPO(NaturalGaussianPolicy, env, policy_kwargs=kwargs).policy
+    kwargs = {"widening": widening, "log_std_init": -1.0}
+    policy = PPO(NaturalGaussianPolicy, env, policy_kwargs=kwargs, seed=0, device="cpu").policy
     assert isinstance(policy, NaturalGaussianPolicy)
-    for update in range(30):  # each narrows one direction, and so widens all
-        policy(torch.as_tensor(env.reset()))
+    return policy, torch.as_tensor(env.reset())
+
+
+def test_the_widening_ends() -> None:
+    policy, observation = _widening_policy(1.0)
+    for update in range(60):  # each narrows one direction, and so widens all
+        policy(observation)
         with torch.no_grad():
             policy.log_scale[update % 6, update % 6] = -1.0
         policy.set_training_mode(True)
     sizes = torch.linalg.svdvals(policy.factor)
-    assert sizes.max() <= WIDEST_STD + 1e-6
-    assert sizes.min() > 0.3
+    assert sizes.max() <= WIDEST_STD * (1.0 + 1e-5)
+    assert sizes.min() > 0.3 * WIDEST_STD
+
+
+def test_the_widening_scales_the_policy_about_its_centre() -> None:
+    policy, observation = _widening_policy(0.1)
+    with torch.no_grad():
+        policy.action_net.bias.normal_()
+        policy.log_scale[0, 0] = -0.5
+        before, centre = policy.get_distribution(observation).mode(), policy.centre.clone()
+        policy(observation)
+        policy.recentre()
+        after = policy.get_distribution(observation).mode()
+    scale = torch.full((), 0.05).exp()
+    torch.testing.assert_close(after - centre, scale * (before - centre), rtol=1e-4, atol=1e-5)
+
+
+def test_what_it_gathers_in_a_rollout_goes_where_the_policy_goes_but_not_to_disk() -> None:
+    policy, observation = _widening_policy(0.1)
+    policy(observation)
+    policy.double()
+    assert policy._mean_sum.dtype == torch.float64
+    assert {"centre", "factor", "log_scale"} <= policy.state_dict().keys()
+    assert "_mean_sum" not in policy.state_dict()
 
 
 @pytest.mark.parametrize(
