@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,8 @@ def train(
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
     model = new_model(config)  # before the folder: what cannot be built leaves none behind
     run = RunFolder.create(out, config)
-    return _learn(run, model, report=report)
+    with _alone(run):
+        return _learn(run, model, report=report)
 
 
 def resume(path: Path, report: Report) -> RunFolder:
@@ -76,6 +78,11 @@ def resume(path: Path, report: Report) -> RunFolder:
         TrainingDivergedError: the agent's numbers are no longer finite.
     """
     run = RunFolder.open(path)
+    with _alone(run):
+        return _go_on(run, report)
+
+
+def _go_on(run: RunFolder, report: Report) -> RunFolder:
     config = run.config
     checkpoints = run.checkpoints()
     if not checkpoints:
@@ -86,7 +93,7 @@ def resume(path: Path, report: Report) -> RunFolder:
     model, wrapped = load_model(checkpoints[-1], config.algo, env)
     if model.num_timesteps >= config.steps and run.has_policy("last"):
         raise GymMaraError(
-            f"the run {str(path)!r} has finished its {config.steps} steps; for more begin a new one"
+            f"the run {str(run.path)!r} has finished its {config.steps} steps; for more begin a new one"
         )
     try:
         state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
@@ -99,6 +106,24 @@ def resume(path: Path, report: Report) -> RunFolder:
             f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
         ) from error
     return _learn(run, model, report=report, best=best, elapsed=elapsed)
+
+
+@contextmanager
+def _alone(run: RunFolder) -> Iterator[None]:
+    """Keep a run to this process; the system frees it when the process is killed.
+
+    Raises:
+        GymMaraError: another process trains it.
+    """
+    lock = FileLock(run.path / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
@@ -152,23 +177,20 @@ def _learn(
 ) -> RunFolder:
     keeper = Keeper(run, best, elapsed, report)
     try:
-        with FileLock(
-            run.path / ".lock", timeout=0
-        ):  # the system frees it when the process is killed
-            model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
+        model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
+        try:
             report(model.num_timesteps, {})
-            try:
-                left = run.config.steps - model.num_timesteps
-                model.learn(left, callback=keeper, reset_num_timesteps=False)
-            finally:
-                model.logger.close()
-    except Timeout:
-        raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
-    except ValueError as error:
-        if isinstance(error, TrainingDivergedError) or _is_finite(model):
+            left = run.config.steps - model.num_timesteps
+            model.learn(left, callback=keeper, reset_num_timesteps=False)
+        finally:
+            model.logger.close()
+    except TrainingDivergedError:
+        raise
+    except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+        if isinstance(error, ValueError) and _is_finite(model):
             raise
         raise TrainingDivergedError(
-            f"the training diverged: the policy's parameters are no longer finite ({error}); "
+            f"the training diverged: its numbers are no longer finite ({error}); "
             "try a smaller learning rate or trust region"
         ) from error
     finally:  # an interrupt among the ways out
@@ -178,7 +200,11 @@ def _learn(
 
 
 def _is_finite(model: OnPolicyAlgorithm) -> bool:
-    return all(bool(parameter.isfinite().all()) for parameter in model.policy.parameters())
+    """Whether a model's parameters are finite, and so are the standard deviations and their inverses."""
+    numbers: list[torch.Tensor] = list(model.policy.parameters())
+    if hasattr(model.policy, "log_std"):
+        numbers += [model.policy.log_std.exp(), (-model.policy.log_std).exp()]
+    return all(bool(each.isfinite().all()) for each in numbers)
 
 
 def _writers(run: RunFolder, steps: int) -> list[KVWriter]:

@@ -130,6 +130,21 @@ def test_a_run_that_another_process_trains_is_left_to_it(
     assert not (tmp_path / name).exists()
 
 
+def test_a_run_that_is_trained_by_itself_is_left_alone(finished_grid: Path, tmp_path: Path) -> None:
+    name, config = next(iter(GRID.runs().items()))
+    path = shutil.copytree(finished_grid / name, tmp_path / name)
+    shutil.rmtree(path / "last")
+    (path / "result.json").unlink()
+    with (
+        FileLock(path / ".lock"),
+        pytest.raises(GymMaraError, match="another process is training"),
+    ):
+        benchmark.run_one(path, config, print)
+    assert not list(tmp_path.glob("*damaged*"))
+    benchmark.run_one(path, config, print)
+    assert read_result(path) is not None
+
+
 def test_the_folder_of_another_grid_is_refused(
     finished_grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

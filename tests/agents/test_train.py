@@ -22,10 +22,12 @@ from filelock import FileLock
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gym_mara.agents import presets
+from gym_mara.agents import callbacks, presets
+from gym_mara.agents import train as train_module
 from gym_mara.agents.evaluate import METRICS, evaluate_run, make_env, spread
 from gym_mara.agents.policy import load_policy
 from gym_mara.agents.run import DamagedRunError, RunFolder, read_progress
+from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.train import resume, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import ROLLOUT, config, silent
@@ -132,7 +134,24 @@ def test_a_run_cut_off_after_its_last_checkpoint_is_finished(
 ) -> None:
     shutil.copytree(finished_run.path, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "last")
-    assert_same_training_but_log(finished_run, resume(tmp_path / "run", silent))
+    (tmp_path / "run" / "learning_curve.png").unlink()
+    resumed = resume(tmp_path / "run", silent)
+    assert_same_training_but_log(finished_run, resumed)
+    assert (resumed.path / "learning_curve.png").is_file()
+
+
+def test_the_curve_is_drawn_before_a_run_counts_as_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(run: RunFolder) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(callbacks, "plot_learning_curve", kill)
+        with pytest.raises(KeyboardInterrupt):
+            train(config(), tmp_path / "run", silent)
+    resumed = resume(tmp_path / "run", silent)
+    assert (resumed.path / "learning_curve.png").is_file()
 
 
 def assert_same_training_but_log(run: RunFolder, other: RunFolder) -> None:
@@ -317,15 +336,31 @@ def test_a_configuration_of_another_form_is_named(
         RunFolder.open(tmp_path)
 
 
-def test_a_run_is_trained_by_one_process_at_a_time(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_a_run_is_trained_by_one_process_at_a_time(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = copy_of(finished_run, tmp_path / "run")
     shutil.rmtree(run.path / "last")
     shutil.rmtree(run.checkpoints()[-1])
     table = run.progress_file.read_bytes()
-    with FileLock(run.path / ".lock"), pytest.raises(GymMaraError, match="another process"):
-        resume(run.path, silent)
+    with monkeypatch.context() as patch, FileLock(run.path / ".lock"):
+        patch.delattr(train_module, "load_model")  # what the other may be writing is not read
+        with pytest.raises(GymMaraError, match="another process"):
+            resume(run.path, silent)
     assert run.progress_file.read_bytes() == table
     assert resume(run.path, silent).has_policy("last")
+
+
+def test_a_run_in_training_is_not_resumed(tmp_path: Path) -> None:
+    refused: list[int] = []
+
+    def meddle(steps: int, shown: dict[str, float]) -> None:
+        with pytest.raises(GymMaraError, match="another process"):
+            resume(tmp_path / "run", silent)
+        refused.append(steps)
+
+    train(config(), tmp_path / "run", meddle)
+    assert refused == [ROLLOUT * n for n in range(4)]
 
 
 def test_a_resumed_tensorboard_log_has_every_step_once(
@@ -341,11 +376,65 @@ def test_a_resumed_tensorboard_log_has_every_step_once(
     assert steps == [ROLLOUT * (n + 1) for n in range(3)]
 
 
-def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
-    preset = presets.preset("ppo", teleports=True)
-    wild = replace(preset, arguments={**preset.arguments, "learning_rate": 1e30})
-    with pytest.raises(TrainingDivergedError, match="diverged"):
-        train(config(), tmp_path / "run", silent, preset=wild)
+# The parameters are NaN; the standard deviation has overflowed; a matrix of the policy cannot be factored; K-FAC's step
+# is not finite.
+@pytest.mark.parametrize(
+    ("algo", "preset_name", "wild"),
+    [
+        ("ppo", "tuned", {"learning_rate": 1e30}),
+        ("ppo", "paper", {"learning_rate": 1e10}),
+        ("trpo", "tuned", {"target_kl": 1e5}),
+        ("acktr", "tuned", {"learning_rate": 1e30}),
+    ],
+)
+def test_a_training_that_diverges_says_so(
+    tmp_path: Path, algo: str, preset_name: str, wild: dict[str, float]
+) -> None:
+    preset = presets.preset(algo, preset_name, teleports=True)
+    preset = replace(preset, arguments={**preset.arguments, **wild})
+    asked = config(algo=algo, steps=6000, checkpoint_every=6000)
+    with pytest.raises(TrainingDivergedError, match="finite"):
+        train(asked, tmp_path / "run", silent, preset=preset)
+
+
+def test_a_training_that_fails_otherwise_says_what_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> None:
+        raise ValueError("something else")
+
+    monkeypatch.setattr(callbacks, "save_policy", fail)
+    with pytest.raises(ValueError, match="something else") as caught:
+        train(config(), tmp_path / "run", silent)
+    assert not isinstance(caught.value, TrainingDivergedError)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_however_a_training_ends_its_environments_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    opened: list[MaraVecEnv] = []
+    closed: list[MaraVecEnv] = []
+    begin, close = MaraVecEnv.__init__, MaraVecEnv.close
+
+    def note_beginning(env: MaraVecEnv, *arguments: Any) -> None:
+        opened.append(env)
+        begin(env, *arguments)
+
+    def note_end(env: MaraVecEnv) -> None:
+        closed.append(env)
+        close(env)
+
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        if steps:
+            raise error
+
+    monkeypatch.setattr(MaraVecEnv, "__init__", note_beginning)
+    monkeypatch.setattr(MaraVecEnv, "close", note_end)
+    with pytest.raises(error):
+        train(config(), tmp_path / "run", cut)
+    assert len(opened) == 3  # to ask whether joints teleport, to train, to evaluate
+    assert {id(env) for env in opened} == {id(env) for env in closed}
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"env": "MARA-v0", "versions": {}}'])
