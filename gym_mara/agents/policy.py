@@ -136,11 +136,7 @@ def load_model(folder: Path, algo: str, env: MaraVecEnv) -> tuple[OnPolicyAlgori
 def _told(folder: Path) -> Iterator[None]:
     """Tell in a line what is wrong with a policy's folder."""
     try:
-        if not zipfile.is_zipfile(folder / "model.zip"):
-            raise zipfile.BadZipFile("model.zip is missing or no zip file")
-        with zipfile.ZipFile(folder / "model.zip") as archive:
-            if broken := archive.testzip():
-                raise zipfile.BadZipFile(f"model.zip: {broken} is not what was written")
+        _check_archive(folder / "model.zip")
         yield
     except DAMAGE as error:
         raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
@@ -148,6 +144,19 @@ def _told(folder: Path) -> Iterator[None]:
         raise GymMaraError(
             f"the policy in {str(folder)!r} does not fit the environment: {error}"
         ) from error
+
+
+def _check_archive(file: Path) -> None:
+    """Raises one of DAMAGE where an archive is not as it was written."""
+    if not zipfile.is_zipfile(file):
+        raise zipfile.BadZipFile(f"{file.name} is missing or no zip file")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            broken = archive.testzip()
+    except RuntimeError as error:  # a flag that says encrypted, or compressed in another way
+        raise zipfile.BadZipFile(f"{file.name}: {error}") from error
+    if broken:
+        raise zipfile.BadZipFile(f"{file.name}: {broken} is not what was written")
 
 
 def normalisation(model: OnPolicyAlgorithm) -> VecNormalize:

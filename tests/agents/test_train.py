@@ -264,6 +264,22 @@ def test_a_checkpoint_with_a_flipped_bit_is_named(
         resume(run.path, silent)
 
 
+# Compressed in another way, encrypted, of a later version of the format.
+@pytest.mark.parametrize(("place", "bit"), [(10, 64), (8, 1), (6, 128)])
+def test_a_policy_whose_directory_of_parts_has_a_flipped_bit_is_named(
+    finished_run: RunFolder, tmp_path: Path, place: int, bit: int
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    file = run.path / "last" / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        directory = archive.start_dir
+    content = bytearray(file.read_bytes())
+    content[directory + place] ^= bit
+    file.write_bytes(content)
+    with pytest.raises(DamagedRunError, match="damaged"):
+        evaluate_run(run, episodes=1)
+
+
 def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
