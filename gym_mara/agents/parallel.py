@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any
 
 from gym_mara.errors import GymMaraError, whole_number
@@ -87,6 +89,24 @@ def run_tasks(
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
     """Hold interrupts back, here for a moment, in a process that begins meanwhile until it lets them in."""
+    before = signal.getsignal(signal.SIGINT)
+    heard: list[tuple[int, FrameType | None]] = []
+    # The mask is inherited. Here it does not suffice: another thread may take the signal, and this one hears of it.
+    here = callable(before) and threading.current_thread() is threading.main_thread()
+    if here:
+        signal.signal(signal.SIGINT, lambda number, frame: heard.append((number, frame)))
+    try:
+        with _masked():
+            yield
+    finally:
+        if here:
+            signal.signal(signal.SIGINT, before)
+        if heard and callable(before):
+            before(*heard[0])
+
+
+@contextmanager
+def _masked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -10,9 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
+from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -288,6 +291,30 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
     assert dict(os.environ) == before
     with pytest.raises(ProcessLookupError):
         os.kill(int(file.read_text()), 0)
+
+
+def test_an_interrupt_leaves_no_process_that_has_just_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[BaseProcess] = []
+    start, end = SpawnProcess.start, threading.Event()
+
+    def interrupted(process: BaseProcess) -> None:
+        start(process)
+        begun.append(process)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+    monkeypatch.setattr(SpawnProcess, "start", interrupted)
+    other = threading.Thread(target=end.wait)  # it takes the signal where the main thread does not
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_tasks({"sleeping": partial(_sleeps, tmp_path / "pid")}, 1, deaf)
+    finally:
+        end.set()
+        other.join()
+    assert [process.exitcode for process in begun] == [-signal.SIGTERM]
 
 
 def test_jobs_must_be_a_number_of_processes() -> None:
