@@ -60,17 +60,6 @@ def algorithm_class(name: str) -> type[OnPolicyAlgorithm]:
     return ALGORITHMS[name]
 
 
-def policy_class(preset: Preset) -> type[ActorCriticPolicy]:
-    """The class of a preset's policy.
-
-    Raises:
-        GymMaraError: there is no such policy.
-    """
-    if preset.policy not in POLICY_CLASSES:
-        raise unknown("policy", preset.policy, POLICY_CLASSES)
-    return POLICY_CLASSES[preset.policy]
-
-
 def policy_arguments(preset: Preset) -> dict[str, Any]:
     """Keyword arguments of a preset's policy."""
     arguments = dict(preset.arguments.get("policy_kwargs", {}))
@@ -106,7 +95,7 @@ def load_policy(
         GymMaraError: the policy is one of another environment.
     """
     preset = Preset(**config.preset)
-    make = policy_class(preset)
+    make = POLICY_CLASSES[preset.policy]
     arguments = policy_arguments(preset)
     policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
     with _told(folder):

@@ -13,18 +13,29 @@ from typing import Any
 
 from gym_mara.errors import unknown
 
+POLICY_FORMS = ("mlp", "natural")
+"""Stable-Baselines3's own, and `gym_mara.agents.natural_gaussian`'s."""
+
 
 @dataclass(frozen=True)
 class Preset:
-    """How an algorithm trains."""
+    """How an algorithm trains.
+
+    Raises:
+        GymMaraError: the form of the policy is unknown.
+    """
 
     num_envs: int
     policy: str = "mlp"
-    """The form of the policy, one of `gym_mara.agents.policy.POLICY_CLASSES`."""
+    """The form of the policy, one of POLICY_FORMS."""
     arguments: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the algorithm's class; see the module for values that change."""
     normalise_observation: bool = False
     normalise_reward: bool = False
+
+    def __post_init__(self) -> None:
+        if self.policy not in POLICY_FORMS:
+            raise unknown("policy", self.policy, POLICY_FORMS)
 
 
 # Where joints are at their targets at once, what comes next hangs on the action alone, hence no discounted future (γ = 0).

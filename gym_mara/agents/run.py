@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 from gym_mara.agents.presets import Preset
 from gym_mara.errors import GymMaraError, unknown
@@ -27,6 +27,7 @@ from gym_mara.errors import GymMaraError, unknown
 POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "sb3_contrib", "torch")
 _ENGINES = ("coal", "dartpy", "python-fcl")  # where they are installed
+_Form = TypeVar("_Form")
 
 
 class DamagedRunError(GymMaraError):
@@ -95,13 +96,10 @@ class RunFolder:
         if not file.is_file():
             raise DamagedRunError(f"{str(path)!r} is no run folder: it has no config.json")
         try:
-            values = json.loads(file.read_text())
+            values = dict(json.loads(file.read_text()))
             values.pop("versions")
-            config = RunConfig(**values)
-            for name in ("steps", "seed", "checkpoint_every"):
-                if type(values[name]) is not int:
-                    raise TypeError(f"{name} is {values[name]!r}")
-            Preset(**config.preset)
+            config = _as(RunConfig, values)
+            _as(Preset, config.preset)
             return cls(path, config)
         except (ValueError, KeyError, TypeError) as error:
             raise DamagedRunError(
@@ -142,6 +140,19 @@ class RunFolder:
                 f"the run {str(self.path)!r} has no {which!r} policy: it has not finished; go on with --resume"
             )
         return folder
+
+
+def _as(form: type[_Form], values: dict[str, Any]) -> _Form:
+    """A dataclass with values that came from a file.
+
+    Raises:
+        TypeError: a field is missing, unknown, or of another type.
+    """
+    made = form(**values)
+    for name, hint in get_type_hints(form).items():
+        if type(value := getattr(made, name)) is not (get_origin(hint) or hint):
+            raise TypeError(f"{name} is {value!r}")
+    return made
 
 
 def write_atomically(file: Path, text: str) -> None:

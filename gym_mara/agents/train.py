@@ -32,7 +32,7 @@ from gym_mara.agents.callbacks import (
     restore_random_state,
 )
 from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.policy import algorithm_class, load_model, policy_arguments, policy_class
+from gym_mara.agents.policy import POLICY_CLASSES, algorithm_class, load_model, policy_arguments
 from gym_mara.agents.run import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
@@ -141,7 +141,7 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     arguments["policy_kwargs"] = policy_arguments(preset)
-    policy = policy_class(preset)
+    policy = POLICY_CLASSES[preset.policy]
     return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
 
 

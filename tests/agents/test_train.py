@@ -25,7 +25,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from gym_mara.agents import callbacks, presets
 from gym_mara.agents import train as train_module
 from gym_mara.agents.evaluate import METRICS, evaluate_run, make_env, spread
-from gym_mara.agents.policy import load_policy
+from gym_mara.agents.policy import POLICY_CLASSES, load_policy
 from gym_mara.agents.run import DamagedRunError, RunFolder, read_progress
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.train import resume, train
@@ -339,8 +339,14 @@ def test_a_policy_of_another_environment_is_refused(
     [
         {"steps": "many"},
         {"seed": 1.5},
+        {"checkpoint_every": True},
+        {"env": None},
+        {"env_options": []},
         {"preset": {}},
+        {"preset": []},
         {"preset": {"num_envs": 1, "colour": "red"}},
+        {"preset": {"num_envs": "many"}},
+        {"preset": {"num_envs": 1, "policy": "mpl"}},
     ],
 )
 def test_a_configuration_of_another_form_is_named(
@@ -350,6 +356,12 @@ def test_a_configuration_of_another_form_is_named(
     (tmp_path / "config.json").write_text(json.dumps(values | change))
     with pytest.raises(DamagedRunError, match="damaged"):
         RunFolder.open(tmp_path)
+
+
+def test_a_preset_of_an_unknown_policy_is_refused() -> None:
+    with pytest.raises(GymMaraError, match=r"unknown policy 'mpl'\. Did you mean 'mlp'"):
+        presets.Preset(num_envs=1, policy="mpl")
+    assert tuple(POLICY_CLASSES) == presets.POLICY_FORMS
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(
@@ -453,7 +465,7 @@ def test_however_a_training_ends_its_environments_are_closed(
     assert {id(env) for env in opened} == {id(env) for env in closed}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"env": "MARA-v0", "versions": {}}'])
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", '{"env": "MARA-v0", "versions": {}}'])
 def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(GymMaraError, match="damaged"):
