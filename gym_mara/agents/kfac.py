@@ -123,7 +123,7 @@ class KFAC(torch.optim.Optimizer):
             How far the model has moved, as a KL divergence.
 
         Raises:
-            TrainingDivergedError: a gradient is not finite; no parameter has changed then.
+            TrainingDivergedError: a gradient, a factor or the step is not finite; no parameter has changed then.
         """
         gradients = [self._gradient(group) for group in self.param_groups]
         if not all(gradient.isfinite().all() for gradient in gradients):
@@ -152,12 +152,18 @@ class KFAC(torch.optim.Optimizer):
         return torch.cat([gradients[0], gradients[1][:, None]], dim=1)
 
     def natural_gradient(self, group: dict[str, Any], gradient: Tensor) -> Tensor:
-        """F⁻¹∇L of one group of parameters, with the damped Fisher matrix F."""
+        """F⁻¹∇L of one group of parameters, with the damped Fisher matrix F.
+
+        Raises:
+            TrainingDivergedError: a factor of F is not finite.
+        """
         if "fisher" in group:
             return gradient / (group["fisher"] + self.damping)
         state = self.state[group["params"][0]]
         a, g = state["A"].double(), state["G"].double()
         mean_a, mean_g = float(a.diagonal().mean()), float(g.diagonal().mean())
+        if not math.isfinite(mean_a * mean_g):
+            raise TrainingDivergedError(f"the Fisher factors are not finite: {_ADVICE}")
         # Of each factor's mean eigenvalue; rounding leaves the factors' smallest ones unknown to some 1e-6 of it.
         relative = max(math.sqrt(self.damping / max(mean_a * mean_g, 1e-30)), _LEAST_DAMPING)
         # Where nothing flows, as through dead units, a factor is zero.

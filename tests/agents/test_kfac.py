@@ -12,7 +12,7 @@ from curvlinops import KFACInverseLinearOperator, KFACLinearOperator
 from torch import Tensor, nn
 
 from gym_mara.agents.kfac import KFAC
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import TrainingDivergedError
 
 EXAMPLES = 50
 
@@ -183,7 +183,7 @@ def test_a_gradient_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
     log_std = nn.Parameter(torch.zeros(2))
     kfac = KFAC([], [(log_std, 2.0)])
     log_std.grad = torch.tensor([math.nan, 0.0])
-    with pytest.raises(GymMaraError, match="not finite"):
+    with pytest.raises(TrainingDivergedError, match="not finite"):
         kfac.step()
     assert not log_std.any()
 
@@ -206,13 +206,34 @@ def test_units_through_which_nothing_flows_stay_as_they_are() -> None:
     assert all(parameter.isfinite().all() for parameter in net.parameters())
 
 
+def test_factors_that_are_not_finite_are_an_error_and_move_nothing() -> None:
+    net = network(2, 3, 1)
+    before = [parameter.clone() for parameter in net.parameters()]
+    kfac = KFAC(linear_layers(net), cold_updates=0)
+    x = torch.full((EXAMPLES, 2), 1e200)  # the units are saturated, and what comes out is finite
+    observe(kfac, net, x, torch.zeros(EXAMPLES, 1))
+    net(x).square().mean().backward()  # type: ignore[no-untyped-call]
+    with pytest.raises(TrainingDivergedError, match="factors are not finite"):
+        kfac.step()
+    assert all(torch.equal(*pair) for pair in zip(net.parameters(), before, strict=True))
+
+
+def test_a_step_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
+    log_std = nn.Parameter(torch.zeros(2))
+    kfac = KFAC([], [(log_std, 2.0)], lr=1e300)
+    log_std.grad = torch.full((2,), 1.0)
+    with pytest.raises(TrainingDivergedError, match="step is not finite"):
+        kfac.step()
+    assert not log_std.any()
+
+
 def test_predictions_that_are_not_finite_leave_the_factors_as_they_were() -> None:
     net = network(2, 1)
     kfac = KFAC(linear_layers(net))
     x = torch.ones(10, 2)
     observe(kfac, net, x, torch.zeros(10, 1))
     x[0, 0] = math.nan
-    with pytest.raises(GymMaraError, match="not finite"):
+    with pytest.raises(TrainingDivergedError, match="not finite"):
         observe(kfac, net, x, torch.zeros(10, 1))
     assert all(f.isfinite().all() for f in kfac.state[linear_layers(net)[0].weight].values())
 
