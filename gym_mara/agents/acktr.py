@@ -25,7 +25,10 @@ from gym_mara.agents.kfac import KFAC
 from gym_mara.errors import GymMaraError
 
 LEAST_STD = 1e-5
-"""Standard deviations stay above this: actions are float32 of order 1, and much below it cannot tell them apart."""
+"""Standard deviations stay above this: actions are float32 of order 1, and much below it cannot tell them apart.
+
+`natural_gaussian` goes down to a tenth of it. Tuned trainings come down to either, so that another value is another result.
+"""
 # The Fisher information of a Gaussian's log standard deviation: E[(∂ log p / ∂ log σ)²].
 _FISHER_OF_LOG_STD = 2.0
 

@@ -24,7 +24,7 @@ from torch.distributions import MultivariateNormal
 from gym_mara.errors import GymMaraError
 
 # Standard deviations stay above this: much below it actions, which are float32 of order 1, no longer tell them apart.
-# ACKTR stops at ten times as much. Tuned trainings come down to either, so that another value is another result.
+# ACKTR stops at ten times that. Tuned trainings come down to either, so that another value is another result.
 LEAST_STD = 1e-6
 # The widening makes none wider than this, five times an action's range. It is there against overflow: where the reward
 # says nothing, as of the last joint without orientation, tuned trainings reach some four.

@@ -153,7 +153,7 @@ def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Pa
         set_random_seed(2)
         learner.learn(64, reset_num_timesteps=False)
     for one, other in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+        assert torch.equal(one, other)
 
 
 def test_the_policy_never_narrows_below_what_float32_resolves() -> None:

@@ -121,6 +121,12 @@ def test_a_bad_trial_is_given_up_whatever_its_rollouts_length(
     assert played[11] < 10
 
 
+def test_a_search_may_be_short(tmp_path: Path) -> None:
+    short = Search(**{**vars(SMALL), "steps": 5, "trials": 1})
+    work(short, tmp_path, deaf)
+    assert best(open_study(short, tmp_path)) is not None
+
+
 def test_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
     with FileLock(tmp_path / ".lock"), pytest.raises(GymMaraError, match="another process"):
