@@ -137,6 +137,8 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
         (["train", "--preset", "papers", "--out", "x"], "unknown preset 'papers'"),
         (["benchmark", "--algos", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
         (["benchmark", "--envs", "MARA-v1", "--out", "x"], "unknown environment 'MARA-v1'"),
+        (["benchmark", "--envs", "MARA-v0, MARA-v0", "--out", "x"], "name each once"),
+        (["benchmark", "--algos", "ppo, trpo ,ppo", "--out", "x"], "name each once"),
         (["benchmark", "--jobs", "0", "--out", "x"], "--jobs must be"),
         (["plot", "nowhere"], "is no grid"),
         (["search", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),

@@ -194,7 +194,7 @@ def test_units_through_which_nothing_flows_stay_as_they_are() -> None:
     with torch.no_grad():
         dead.bias.fill_(-100.0)
     before = [parameter.clone() for parameter in dead.parameters()]
-    kfac = KFAC(linear_layers(net), lr=0.1)
+    kfac = KFAC(linear_layers(net), lr=0.1, cold_updates=0)
     x, y = torch.randn(EXAMPLES, 3), torch.randn(EXAMPLES, 2)
     for _ in range(3):
         observe(kfac, net, x, y)
