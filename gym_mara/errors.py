@@ -14,16 +14,16 @@ class GymMaraError(ValueError):
 
 
 class MissingExtraError(GymMaraError, ImportError):
-    """A library that an optional part needs is not installed."""
+    """A library that an optional part needs is not installed, or too old."""
 
-    def __init__(self, part: str, library: str, extra: str) -> None:
-        super().__init__(
-            f"{part} needs {library}, which is not installed: pip install 'gym_mara[{extra}]'"
-        )
-        self.part, self.library, self.extra = part, library, extra
+    def __init__(
+        self, part: str, library: str, extra: str, why: str = "which is not installed"
+    ) -> None:
+        super().__init__(f"{part} needs {library}, {why}: pip install 'gym_mara[{extra}]'")
+        self._arguments = part, library, extra, why
 
-    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str]]:
-        return type(self), (self.part, self.library, self.extra)
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str, str]]:
+        return type(self), self._arguments
 
 
 class TrainingDivergedError(GymMaraError):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError
+
 import pytest
 
+from gym_mara import extras
 from gym_mara.errors import GymMaraError, MissingExtraError, unknown
 from gym_mara.testing import pickled
 
@@ -38,3 +41,47 @@ def test_a_missing_extra_says_what_to_install_and_pickles() -> None:
 
 def test_every_error_is_a_value_error() -> None:
     assert issubclass(GymMaraError, ValueError)
+
+
+def test_a_library_that_is_too_old_is_named_with_the_version_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(extras, "version", lambda name: "0.1")
+    with (
+        pytest.raises(MissingExtraError, match=r"dart' needs dartpy>=\S+, and 0.1 is installed"),
+        extras.needs("the backend 'dart'", "dart"),
+    ):
+        pass
+
+
+def test_a_library_that_is_absent_is_named_with_the_version_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def absent(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(extras, "version", absent)
+    with (
+        pytest.raises(MissingExtraError, match=r"films needs imageio-ffmpeg>=\S+, which is not"),
+        extras.needs("films", "render", "imageio-ffmpeg"),
+    ):
+        pass
+
+
+def test_a_library_that_does_not_load_is_told_with_the_reason() -> None:
+    with (
+        pytest.raises(MissingExtraError, match=r"dartpy, which cannot be imported \(no libGL"),
+        extras.needs("the backend 'dart'", "dart", "dartpy"),
+    ):
+        raise ImportError("no libGL", name="dartpy")
+
+
+def test_a_mistake_of_ours_is_no_missing_library() -> None:
+    with pytest.raises(ModuleNotFoundError) as told, extras.needs("training", "train"):
+        import gym_mara.nowhere  # type: ignore[import-not-found] # noqa: F401
+    assert not isinstance(told.value, MissingExtraError)
+
+
+def test_every_extra_that_the_package_asks_for_exists() -> None:
+    for extra in ("dart", "fcl", "render", "robots", "train"):
+        assert extras._requirements(extra), extra

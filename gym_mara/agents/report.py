@@ -20,13 +20,12 @@ from gym_mara.agents.transfer import settled_after
 from gym_mara.agents.watch import film_run
 from gym_mara.backends import backend_names
 from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 
-try:
+with needs("a report", "render", "plotly"):
     import plotly.graph_objects as go
     from plotly.subplots import make_subplots
-except ImportError as error:
-    raise MissingExtraError("a report", "plotly", "render") from error
 
 _COLOURS = ("#1f77b4", "#d95f02", "#2ca02c", "#9467bd")
 _LIMIT = {"color": "#999", "dash": "dash", "width": 1}

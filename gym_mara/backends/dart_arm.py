@@ -9,15 +9,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import CoalChecker, CollisionChecker, NoChecker
 from gym_mara.robot.kinematics import motion_axis
 
-try:
+with needs("the backend 'dart'", "dart"):
     import dartpy as dart
-except ImportError as error:
-    raise MissingExtraError("the backend 'dart'", "dartpy", "dart") from error
 
 Floats = NDArray[np.float64]
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.extras import needs
 from gym_mara.tasks import TASKS
 
 out = Console()
@@ -28,14 +29,9 @@ SetOption = Annotated[
 ]
 
 
-@contextmanager
-def needs_agents() -> Iterator[None]:
+def needs_agents() -> AbstractContextManager[None]:
     """Name the extra where a library that training needs is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        library = error.name or str(error)
-        raise MissingExtraError("training and evaluation", library, "train") from error
+    return needs("training and evaluation", "train")
 
 
 @contextmanager

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.extras import needs
 from gym_mara.rendering.renderer import Picture
 
-try:
+with needs("films", "render", "imageio", "imageio-ffmpeg"):
     import imageio.v2 as imageio
     import imageio_ffmpeg  # noqa: F401 - imageio writes MP4 with it
-except ImportError as error:
-    raise MissingExtraError("films", "imageio with imageio-ffmpeg", "render") from error
 
 FORMATS = (".mp4", ".gif")
 HIGHEST_RATE = 50.0

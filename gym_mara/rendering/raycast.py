@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.errors import MissingExtraError
+from gym_mara.extras import needs
 from gym_mara.rendering.look import (
     AMBIENT,
     BACKGROUND,
@@ -25,11 +25,9 @@ from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
 from gym_mara.state import View
 
-try:
+with needs("the renderer 'raycast'", "render", "embreex"):
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
-except ImportError as error:
-    raise MissingExtraError("the renderer 'raycast'", "embreex", "render") from error
 
 Singles = NDArray[np.float32]
 Whole = NDArray[np.int32]

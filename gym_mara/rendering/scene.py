@@ -9,14 +9,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from gym_mara.errors import MissingExtraError
+from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.state import View
 
-try:
+with needs("rendering", "render", "trimesh"):
     import trimesh
-except ImportError as error:
-    raise MissingExtraError("rendering", "trimesh", "render") from error
 
 Floats = NDArray[np.float64]
 Colour = tuple[float, float, float]

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gym_mara.backends import backend_names
-from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.errors import GymMaraError
+from gym_mara.extras import needs
 from gym_mara.rendering.look import look_at
 from gym_mara.rendering.scene import Floats, Scene
 from gym_mara.rendering.settings import RenderSettings
 
-try:
+with needs("the viewer", "render", "viser"):
     import viser
-except ImportError as error:
-    raise MissingExtraError("the viewer", "viser", "render") from error
 
 from gym_mara.rendering.stage import Stage
 

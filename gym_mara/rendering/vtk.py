@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.errors import MissingExtraError
+from gym_mara.extras import needs
 from gym_mara.rendering.look import (
     AMBIENT,
     BACKGROUND,
@@ -29,13 +29,11 @@ from gym_mara.rendering.scene import Floats, Part, Scene
 from gym_mara.rendering.settings import RenderSettings
 from gym_mara.state import View
 
-try:
+with needs("the renderer 'vtk'", "render", "pyvista"):
     import pyvista
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkObject, vtkUnsignedCharArray
     from vtkmodules.vtkCommonDataModel import vtkPlane
-except ImportError as error:
-    raise MissingExtraError("the renderer 'vtk'", "pyvista", "render") from error
 
 _SAMPLES = 4
 # Draws nothing, and ends well where VTK could draw; where it cannot, VTK may take its process along.

@@ -8,15 +8,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.errors import GymMaraError
+from gym_mara.extras import needs
 from gym_mara.robot.collision import CollisionChecker
 from gym_mara.robot.model import RobotModel
 
-try:
+with needs("the collision engine 'fcl'", "fcl"):
     import fcl
     import trimesh
-except ImportError as error:
-    raise MissingExtraError("the collision engine 'fcl'", "python-fcl or trimesh", "fcl") from error
 
 
 class FclChecker(CollisionChecker):
