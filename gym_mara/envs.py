@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.rendering import Pictures, RenderSettings
-from gym_mara.robot import RobotModel
+from gym_mara.robot import RobotLike
 from gym_mara.simulation import Mask, Simulation
 from gym_mara.tasks import Task
 
@@ -33,7 +33,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
     Args:
         task: the name of a task, such as "MARA-v0", or a Task.
-        robot: a robot's name, the path of a URDF, or a RobotModel.
+        robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
         ee_frame: the end-effector link of a URDF of your own.
         backend: the name of a backend.
         render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
@@ -51,7 +51,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self,
         task: str | Task = "MARA-v0",
         *,
-        robot: str | RobotModel = "mara",
+        robot: RobotLike = "mara",
         ee_frame: str | None = None,
         backend: str = "pinocchio",
         render_mode: str | None = None,
@@ -158,7 +158,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         num_envs: int = 1,
         task: str | Task = "MARA-v0",
         *,
-        robot: str | RobotModel = "mara",
+        robot: RobotLike = "mara",
         ee_frame: str | None = None,
         backend: str = "pinocchio",
         render_mode: str | None = None,

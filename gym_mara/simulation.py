@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
 from gym_mara.errors import GymMaraError, whole_number
-from gym_mara.robot import RobotModel
+from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.robot.collision import touching_links
 from gym_mara.robot.reachability import FreePoses
 from gym_mara.state import SimState, View
@@ -48,7 +48,7 @@ class Simulation:
     Args:
         task: the name of a task, or a task.
         num_envs: N.
-        robot: a robot's name, the path of a URDF, or a RobotModel.
+        robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
         ee_frame: the end-effector link of a URDF of your own.
         backend: the name of a backend.
         options: values of the task and settings of the backend, by keyword.
@@ -63,7 +63,7 @@ class Simulation:
         self,
         task: str | Task,
         num_envs: int,
-        robot: str | RobotModel,
+        robot: RobotLike,
         ee_frame: str | None,
         backend: str,
         options: dict[str, Any],

@@ -22,6 +22,32 @@ PATH_ENDS = ((0.5, -1.9, -0.3, -2.4, 1.1, -2.6), (0.5, -1.9, -0.3, 2.4, 1.1, -2.
 """Two free configurations of MARA between which motor4 takes the tool through the arm, near -1.15 to 1.06 rad."""
 
 
+MODULAR_ARMS: dict[int, list[str]] = {
+    3: ["base", "motor_large", "motor_medium", "tool"],
+    4: ["base", "motor_large", "link_straight", "motor_medium", "tool"],
+    5: ["base", "motor_large", "motor_medium", "link_bent", "motor_small", "tool"],
+    6: [
+        "base",
+        "motor_medium",
+        "link_straight",
+        "motor_medium",
+        "link_bent",
+        "motor_small",
+        "tool",
+    ],
+    7: [
+        "base",
+        "motor_large",
+        "motor_large",
+        "link_bent",
+        "motor_medium",
+        "link_bent",
+        "motor_small",
+        "tool",
+    ],
+}
+"""An arm of MARA's modules for each number of joints."""
+
 robot_model = functools.cache(RobotModel.load)
 
 

@@ -7,21 +7,26 @@ import pytest
 
 from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv
+from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import TASKS
-from tests.helpers import robot_model
+from tests.helpers import MODULAR_ARMS, robot_model
 
-ARMS = ("ur5", "ur10", "panda", "so100", "talos_arm")
+ARMS: dict[str, RobotLike] = {
+    **{name: name for name in ("ur5", "ur10", "panda", "so100", "talos_arm")},
+    **{f"modular {joints}": arm for joints, arm in MODULAR_ARMS.items()},
+}
 
 
 @pytest.mark.parametrize("backend", backend_names())
 @pytest.mark.parametrize("arm", ARMS)
 def test_an_arm_runs_every_task_and_shows_itself(arm: str, backend: str) -> None:
-    rng = np.random.default_rng(0)
+    rng, named = np.random.default_rng(0), ARMS[arm]
+    robot = robot_model(named) if isinstance(named, str) else RobotModel.load(named)
     for task in TASKS:
         draws = task == "MARACollisionOrient-v0"
         env = MaraEnv(
             task,
-            robot=robot_model(arm),
+            robot=robot,
             backend=backend,
             render_mode="rgb_array" if draws else None,
             renderer="raycast",

@@ -13,6 +13,7 @@ from gym_mara.backends import backend_names
 from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out, task_name
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.catalog import robot_names
+from gym_mara.robot.modules import MODULES
 from gym_mara.tasks import TASKS
 
 
@@ -27,7 +28,7 @@ def list_() -> None:
         table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
-    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
+    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF, or a list of:", ", ".join(MODULES))
 
 
 def rewards(

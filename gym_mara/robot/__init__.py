@@ -1,5 +1,5 @@
 """The robot: what the arm is, where its links are at a configuration, and whether they collide there."""
 
-from gym_mara.robot.model import RobotModel
+from gym_mara.robot.model import RobotLike, RobotModel
 
-__all__ = ["RobotModel"]
+__all__ = ["RobotLike", "RobotModel"]

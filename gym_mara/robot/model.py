@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import catalog
 from gym_mara.robot.kinematics import Kinematics
+from gym_mara.robot.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
 from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain, visual_geometry
 
@@ -31,7 +32,12 @@ class RobotModel:
 
     name: str
     urdf: Path
+    """The file that it was read from; MARA's for an arm composed of MARA's modules."""
     srdf: Path | None
+    modules: tuple[str, ...]
+    """What it was composed of, from the base to the tool; nothing otherwise."""
+    xml: str
+    """Its description, all joints off the chain fixed."""
     ee_frame: str
     joint_names: tuple[str, ...]
     lower: Floats
@@ -51,8 +57,8 @@ class RobotModel:
     """Pinocchio's collision geometry, with its collision pairs set."""
 
     @classmethod
-    def load(cls, robot: str | Path | RobotModel, ee_frame: str | None = None) -> RobotModel:
-        """The robot of a name ("mara", "ur5", …), of a path to a URDF, or itself.
+    def load(cls, robot: RobotLike | Path, ee_frame: str | None = None) -> RobotModel:
+        """The robot of a name ("mara", "ur5", …), of a path to a URDF, of a list of modules, or itself.
 
         Raises:
             GymMaraError: the name is unknown, or the URDF is not one of a fixed-base arm.
@@ -60,9 +66,11 @@ class RobotModel:
         """
         if isinstance(robot, RobotModel):
             return robot
+        if isinstance(robot, (list, tuple)):
+            return cls.from_modules(robot)
         if not isinstance(robot, (str, Path)):
             raise GymMaraError(
-                f"robot must be a name, the path of a URDF or a RobotModel, not {robot!r}"
+                f"robot must be a name, the path of a URDF, a list of modules or a RobotModel, not {robot!r}"
             )
         if isinstance(robot, Path) or robot.endswith((".urdf", ".xml")):
             path = Path(robot).absolute()
@@ -98,13 +106,45 @@ class RobotModel:
         root = read_xml(urdf, "URDF")
         semantics = read_srdf(srdf) if srdf else Semantics()
         ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
+        return cls._from_xml(root, semantics, ee_frame, name, urdf, srdf)
+
+    @classmethod
+    def from_modules(cls, modules: Sequence[str]) -> RobotModel:
+        """Compose an arm of 3 to 7 joints from MARA's modules, on MARA's table.
+
+        Args:
+            modules: from "base" to "tool"; between them "motor_large", "motor_medium", "motor_small", "link_straight" and
+                "link_bent", as often and in such an order as their faces fit. A motor turns what is joined to either face.
+
+        Raises:
+            GymMaraError: a module is unknown or does not fit, or the number of joints is another.
+        """
+        urdf = catalog.find("mara").urdf
+        root = compose(urdf, modules)
+        name = "mara" if tuple(modules) == MARA else None
+        return cls._from_xml(root, Semantics(), EE_FRAME, name, urdf, None, tuple(modules))
+
+    @classmethod
+    def _from_xml(
+        cls,
+        root: ElementTree.Element,
+        semantics: Semantics,
+        ee_frame: str,
+        name: str | None,
+        urdf: Path,
+        srdf: Path | None,
+        modules: tuple[str, ...] = (),
+    ) -> RobotModel:
         chain = make_chain(urdf, root, ee_frame)
-        model, geometry = build(urdf, ElementTree.tostring(root, encoding="unicode"))
+        xml = ElementTree.tostring(root, encoding="unicode")
+        model, geometry = build(urdf, xml)
         home = _home(semantics, chain, model)
-        robot = cls(
+        return cls(
             name=name or root.get("name") or urdf.stem,
             urdf=urdf,
             srdf=srdf,
+            modules=modules,
+            xml=xml,
             ee_frame=ee_frame,
             joint_names=tuple(model.names)[1:],
             lower=_read_only(model.lowerPositionLimit),
@@ -116,7 +156,6 @@ class RobotModel:
             model=model,
             geometry=geometry,
         )
-        return robot
 
     @property
     def num_joints(self) -> int:
@@ -131,7 +170,7 @@ class RobotModel:
     @cached_property
     def visual(self) -> pin.GeometryModel:
         """Pinocchio's visual geometry; read when first asked for."""
-        return visual_geometry(self.urdf, self.model)
+        return visual_geometry(self.urdf, self.xml, self.model)
 
     def kinematics(self) -> Kinematics:
         """Forward kinematics of many configurations at once, with a work space of its own."""
@@ -196,7 +235,9 @@ class RobotModel:
         return array
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Pinocchio's geometry does not pickle; the files say it all.
+        # Pinocchio's geometry does not pickle; the modules, or the files, say it all.
+        if self.modules:
+            return RobotModel.from_modules, (self.modules,)
         return _reload, (self.urdf, self.ee_frame, self.srdf, self.name)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
@@ -204,6 +245,10 @@ class RobotModel:
 
     def __repr__(self) -> str:
         return f"RobotModel({self.name!r}, joints={list(self.joint_names)}, ee_frame={self.ee_frame!r})"
+
+
+RobotLike = str | Sequence[str] | RobotModel
+"""A robot's name, the path of its URDF, its modules, or itself."""
 
 
 def _reload(urdf: Path, ee_frame: str, srdf: Path | None, name: str) -> RobotModel:

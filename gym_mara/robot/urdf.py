@@ -89,14 +89,13 @@ def build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
         return model, _geometry(urdf, model, text, pin.GeometryType.COLLISION)
 
 
-def visual_geometry(urdf: Path, model: pin.Model) -> pin.GeometryModel:
-    """What a URDF says that the links of a model look like; where it says nothing, their collision geometry.
+def visual_geometry(urdf: Path, text: str, model: pin.Model) -> pin.GeometryModel:
+    """What a URDF's text says that the links of a model look like; where it says nothing, their collision geometry.
 
     Raises:
         GymMaraError: a mesh is not found.
     """
     with _told(urdf):
-        text = urdf.read_text()
         geometry = _geometry(urdf, model, text, pin.GeometryType.VISUAL)
         if geometry.ngeoms == 0:
             geometry = _geometry(urdf, model, text, pin.GeometryType.COLLISION)
