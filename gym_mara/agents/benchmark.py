@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from gym_mara.agents.callbacks import Report
 from gym_mara.agents.evaluate import evaluate_run
-from gym_mara.agents.parallel import Say, run_tasks
+from gym_mara.agents.parallel import Engine, Say
 from gym_mara.agents.policy import algorithm_class
 from gym_mara.agents.presets import PRESETS
 from gym_mara.agents.run import (
@@ -150,14 +151,14 @@ def _read(folder: Path) -> tuple[Grid, Any]:
 
 
 def run_grid(
-    folder: Path, grid: Grid, jobs: int, hear: Callable[[str, Any], None]
+    folder: Path, grid: Grid, engine: Engine, hear: Callable[[str, Any], None]
 ) -> dict[str, str]:
-    """Train what is not yet trained, so many runs at a time.
+    """Train what is not yet trained.
 
     Args:
-        folder: of the grid.
+        folder: of the grid; every process that trains must find it there.
         grid: what to train.
-        jobs: how many processes.
+        engine: what runs the trainings: a number of processes of this machine, say, or a cluster.
         hear: called with a run's name and (its steps, what to show); with a run's name and a string, a notice.
 
     Returns:
@@ -165,16 +166,22 @@ def run_grid(
     """
     open_grid(folder, grid)
     open_runs = {name: c for name, c in grid.runs().items() if read_result(folder / name) is None}
+    folder = folder.absolute()
     tasks = {name: partial(run_one, folder / name, config) for name, config in open_runs.items()}
-    return run_tasks(tasks, jobs, hear)
+    return engine(tasks, hear)
 
 
 def run_one(path: Path, config: RunConfig, say: Say) -> None:
     """Train one run, or go on with it, and write its result; what is damaged is set aside and begun anew.
 
     Raises:
-        GymMaraError: another process trains it, and goes on doing so for longer than PATIENCE.
+        GymMaraError: its grid is not here, or another process trains it for longer than PATIENCE.
     """
+    if not path.parent.is_dir():
+        raise GymMaraError(
+            f"{platform.node()} does not find the grid {str(path.parent)!r}: "
+            "choose an --out on storage that all machines share"
+        )
 
     def report(steps: int, shown: dict[str, float]) -> None:
         say((steps, dict(shown)))

@@ -9,6 +9,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any
@@ -17,23 +18,26 @@ from gym_mara.errors import GymMaraError, whole_number
 
 Say = Callable[[Any], None]
 Task = Callable[[Say], None]
+Hear = Callable[[str, Any], None]
+Engine = Callable[[Mapping[str, Task], Hear], dict[str, str]]
+"""Runs tasks, calls with a task's name and what it said, and returns what went wrong with those that failed."""
 
 # Several processes share the cores; none may use them all for itself.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _SPAWN = multiprocessing.get_context("spawn")
 
 
 def run_tasks(
     tasks: Mapping[str, Task],
+    hear: Hear,
     jobs: int,
-    hear: Callable[[str, Any], None],
 ) -> dict[str, str]:
     """Run tasks, so many at a time, each in a new process.
 
     Args:
         tasks: name → what to do; it pickles, and is given a function by which to say things.
-        jobs: how many at a time.
         hear: called with a task's name and what it said.
+        jobs: how many at a time.
 
     Returns:
         Name → what went wrong, of the tasks that failed; the others go on.
@@ -43,8 +47,8 @@ def run_tasks(
         KeyboardInterrupt: the user interrupted; no process is left.
     """
     jobs = whole_number("jobs", jobs)
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     waiting = list(tasks.items())
     running: dict[Connection, tuple[str, Any]] = {}
     failed: dict[str, str] = {}
@@ -118,7 +122,7 @@ def _masked() -> Iterator[None]:
 
 
 def _work(task: Task, mouth: Connection) -> None:
-    """In the process: do the task; what the user can mend is told in a line, all else with where it arose."""
+    """In the process: do the task, and tell what went wrong."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
 
     def say(message: Any) -> None:
@@ -127,9 +131,17 @@ def _work(task: Task, mouth: Connection) -> None:
         except OSError:
             os._exit(1)  # nobody is left to hear
 
+    reason = told(partial(task, say))
+    if reason is not None:
+        with suppress(OSError):
+            mouth.send(("failed", reason))
+
+
+def told(task: Callable[[], None]) -> str | None:
+    """Do a task; what went wrong, in a line where the user can mend it, else with where it arose."""
     try:
-        task(say)
+        task()
     except Exception as error:
         known = isinstance(error, (GymMaraError, OSError))
-        with suppress(OSError):
-            mouth.send(("failed", str(error) if known else traceback.format_exc().rstrip()))
+        return str(error) if known else traceback.format_exc().rstrip()
+    return None

@@ -126,7 +126,7 @@ def run_search(
                 study.tell(trial.number, state=_State.FAIL)
                 study.enqueue_trial({**trial.system_attrs.get("fixed_params", {}), **trial.params})
             tasks = {f"worker {i}": partial(work, search, folder) for i in range(jobs)}
-            return run_tasks(tasks, jobs, hear)
+            return run_tasks(tasks, hear, jobs)
     except Timeout:
         raise GymMaraError(f"another process is searching in {str(folder)!r}") from None
 

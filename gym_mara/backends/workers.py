@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
@@ -30,7 +31,7 @@ class WorkerDiedError(GymMaraError):
 def choose_workers(num_envs: int, workers: int | None) -> int:
     """How many processes N arms are spread over: those that were asked for, or as many as there are cores.
 
-    In a process that multiprocessing has begun it is one: its parent shares out the cores.
+    In a process that multiprocessing or Ray has begun it is one: whoever began it shares out the cores.
 
     Raises:
         GymMaraError: the arms cannot be shared out equally.
@@ -43,9 +44,18 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
                 f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
             )
         return workers
-    if multiprocessing.parent_process() is not None:
+    if multiprocessing.parent_process() is not None or _in_ray_worker():
         return 1
     return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)
+
+
+def _in_ray_worker() -> bool:
+    ray = sys.modules.get("ray")
+    return (
+        ray is not None
+        and ray.is_initialized()
+        and ray.get_runtime_context().get_task_id() is not None
+    )
 
 
 def cores() -> list[int]:

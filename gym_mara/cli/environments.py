@@ -28,7 +28,8 @@ def list_() -> None:
         table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
-    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF, or a list of:", ", ".join(MODULES))
+    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
+    out.print("Modules of an arm:", ", ".join(MODULES))
 
 
 def rewards(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,11 +22,14 @@ from gym_mara.cli.common import (
     task_name,
     whole,
 )
-from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
     from gym_mara.agents.benchmark import Grid
+    from gym_mara.agents.parallel import Engine
+
+ENGINES = ("local", "ray")
 
 StepsOption = Annotated[float, typer.Option(help="Environment steps of each run, such as 1e6.")]
 JobsOption = Annotated[
@@ -48,6 +52,16 @@ def benchmark(
         float, typer.Option(help="Steps between two checkpoints of a run.")
     ] = 5e4,
     jobs: JobsOption = None,
+    engine: Annotated[
+        str,
+        typer.Option(help="What runs them: local, processes of this machine, or ray, a cluster."),
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the Ray cluster, host:port; by default RAY_ADDRESS, or this machine."
+        ),
+    ] = None,
     out_folder: Annotated[
         Path | None,
         typer.Option("--out", help="Folder of the grid; one that was cut off is gone on with."),
@@ -67,7 +81,7 @@ def benchmark(
         backend=backend,
         checkpoint_every=whole("--checkpoint-every", checkpoint_every),
     )
-    workers = _jobs(jobs)
+    runs_tasks = _engine(engine, jobs, address)
     folder = out_folder or Path("runs") / f"benchmark_{preset}"
     open_grid(folder, grid)
     with interruptible(
@@ -77,7 +91,7 @@ def benchmark(
         view = _GridView(folder, grid)
         with Live(get_renderable=view.table, console=out, refresh_per_second=2) as live:
             view.notice = live.console.print
-            failed = run_grid(folder, grid, workers, view.hear)
+            failed = run_grid(folder, grid, runs_tasks, view.hear)
     for name, reason in failed.items():
         out.print(f"{name} failed: {reason}", style="red", markup=False, soft_wrap=True)
     if len(failed) < len(grid.runs()):
@@ -142,6 +156,23 @@ def search(
     if failed:
         raise GymMaraError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
     show_best()
+
+
+def _engine(name: str, jobs: int | None, address: str | None) -> Engine:
+    """What runs tasks, as the options have it."""
+    if name not in ENGINES:
+        raise unknown("engine", name, ENGINES)
+    if name == "local":
+        if address is not None:
+            raise GymMaraError("--address is that of a Ray cluster: give --engine ray too")
+        from gym_mara.agents.parallel import run_tasks
+
+        return partial(run_tasks, jobs=_jobs(jobs))
+    if jobs is not None:
+        raise GymMaraError("--jobs counts processes of this machine; a cluster uses all its cores")
+    from gym_mara.agents.cluster import run_on_ray
+
+    return partial(run_on_ray, address=address)
 
 
 def _jobs(jobs: int | None) -> int:

@@ -26,7 +26,7 @@ from filelock import FileLock
 from gym_mara.agents import benchmark
 from gym_mara.agents.benchmark import Grid, open_grid, read_result, run_grid
 from gym_mara.agents.figures import format_interval, interquartile_mean, plot_grid
-from gym_mara.agents.parallel import Say, run_tasks
+from gym_mara.agents.parallel import Engine, Say, run_tasks
 from gym_mara.agents.presets import PRESETS
 from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
@@ -38,11 +38,16 @@ def deaf(name: str, message: Any) -> None:
     """What the runs say is not heard."""
 
 
+def processes(jobs: int) -> Engine:
+    """So many processes of this machine."""
+    return partial(run_tasks, jobs=jobs)
+
+
 @pytest.fixture(scope="session")
 def finished_grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A grid that was trained to its end; tests must not change it."""
     folder = Path(tmp_path_factory.mktemp("grids")) / "grid"
-    assert run_grid(folder, GRID, 2, deaf) == {}
+    assert run_grid(folder, GRID, processes(2), deaf) == {}
     return folder
 
 
@@ -57,7 +62,9 @@ def test_every_run_leaves_its_result(finished_grid: Path) -> None:
 
 def test_what_has_finished_is_not_trained_again(finished_grid: Path) -> None:
     said: list[str] = []
-    assert run_grid(finished_grid, GRID, 1, lambda name, message: said.append(name)) == {}
+    assert (
+        run_grid(finished_grid, GRID, processes(1), lambda name, message: said.append(name)) == {}
+    )
     assert not any(said)
 
 
@@ -74,7 +81,7 @@ def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_p
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert run_grid(folder, GRID, 2, deaf) == {}
+    assert run_grid(folder, GRID, processes(2), deaf) == {}
     for name in GRID.runs():
         mine, theirs = read_result(folder / name), read_result(finished_grid / name)
         assert mine is not None
@@ -92,7 +99,9 @@ def test_a_damaged_run_is_named_set_aside_and_run_again(
     (folder / name / "result.json").unlink()
     (folder / name / victim).write_bytes(b"\x00 no such thing")
     said: list[Any] = []
-    assert run_grid(folder, GRID, 1, lambda who, message: said.append((who, message))) == {}
+    assert (
+        run_grid(folder, GRID, processes(1), lambda who, message: said.append((who, message))) == {}
+    )
     assert any(who == name and "set aside" in str(message) for who, message in said)
     assert (folder / f"{name}.damaged1").is_dir()
     after = read_result(folder / name)
@@ -107,12 +116,12 @@ def test_without_room_to_write_runs_fail_and_can_be_gone_on_with(
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))  # of any file, as on a full disk
-        failed = run_grid(tmp_path / "grid", GRID, 2, deaf)
+        failed = run_grid(tmp_path / "grid", GRID, processes(2), deaf)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert failed.keys() == GRID.runs().keys()
     assert all("File too large" in reason for reason in failed.values())
-    assert run_grid(tmp_path / "grid", GRID, 2, deaf) == {}
+    assert run_grid(tmp_path / "grid", GRID, processes(2), deaf) == {}
     for name in GRID.runs():
         mine, theirs = read_result(tmp_path / "grid" / name), read_result(finished_grid / name)
         assert mine is not None
@@ -258,14 +267,14 @@ def _counts_workers(say: Say) -> None:
 
 def test_a_task_has_its_core_and_no_more() -> None:
     heard: list[Any] = []
-    run_tasks({"one": _counts_workers}, 1, lambda name, message: heard.append(message))
+    run_tasks({"one": _counts_workers}, lambda name, message: heard.append(message), 1)
     assert heard == [1]
 
 
 def test_a_task_whose_process_dies_does_not_stop_the_others() -> None:
     heard: list[tuple[str, Any]] = []
     tasks = {"dying": _dies, "full": _errs, "blundering": _blunders, "well": _speaks}
-    failed = run_tasks(tasks, 1, lambda name, message: heard.append((name, message)))
+    failed = run_tasks(tasks, lambda name, message: heard.append((name, message)), 1)
     assert failed.keys() == {"dying", "full", "blundering"}
     assert "_blunders" in failed["blundering"], "where it arose"
     assert "ended with -9" in failed["dying"]
@@ -287,7 +296,7 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
     file = tmp_path / "pid"
     before = dict(os.environ)
     with pytest.raises(KeyboardInterrupt):
-        run_tasks({"sleeping": partial(_sleeps, file)}, 1, interrupt)
+        run_tasks({"sleeping": partial(_sleeps, file)}, interrupt, 1)
     assert dict(os.environ) == before
     with pytest.raises(ProcessLookupError):
         os.kill(int(file.read_text()), 0)
@@ -310,7 +319,7 @@ def test_an_interrupt_leaves_no_process_that_has_just_begun(
     other.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_tasks({"sleeping": partial(_sleeps, tmp_path / "pid")}, 1, deaf)
+            run_tasks({"sleeping": partial(_sleeps, tmp_path / "pid")}, deaf, 1)
     finally:
         end.set()
         other.join()
@@ -319,7 +328,7 @@ def test_an_interrupt_leaves_no_process_that_has_just_begun(
 
 def test_jobs_must_be_a_number_of_processes() -> None:
     with pytest.raises(GymMaraError, match="jobs"):
-        run_tasks({}, 0, deaf)
+        run_tasks({}, deaf, 0)
 
 
 def test_the_grid_says_what_it_is(finished_grid: Path) -> None:
