@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test lint bench experiment test-oldest test-wheel clean
+.PHONY: demo test lint bench experiment test-oldest test-rllib test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
@@ -28,21 +28,26 @@ experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four en
 	$(BIN)/gym-mara benchmark --out runs/experiment
 
 test-oldest: ## Run the tests of all that Gymnasium calls, with the oldest that is supported.
-	$(MAKE) test VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt TESTS="$(GYMNASIUM_TESTS)"
+	$(MAKE) test VENV=.venv-oldest EXTRAS=test CONSTRAINTS=constraints-oldest.txt TESTS="$(GYMNASIUM_TESTS)"
+
+test-rllib: ## Run the example of RLlib, which pins an older Gymnasium, in an environment of its own.
+	$(MAKE) .venv-rllib/.ready VENV=.venv-rllib EXTRAS=rllib
+	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
 
 test-wheel: ## Build the wheel, install it away from the checkout, and use every environment from there.
 	.ci/test-wheel $(PYTHON)
 
 clean: ## Remove the virtual environments and what the tools left.
-	rm -rf .venv .venv-oldest build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt
+EXTRAS ?= dev
 TESTS ?=
-GYMNASIUM_TESTS = $(wildcard tests/test_*.py) tests/rendering/test_pictures.py $(addprefix tests/agents/test_,sb3.py train.py)
+GYMNASIUM_TESTS = $(filter-out tests/test_examples.py,$(wildcard tests/test_*.py)) tests/rendering/test_pictures.py $(addprefix tests/agents/test_,sb3.py train.py)
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python $(PIP_INSTALL) -c $(CONSTRAINTS) -e '.[dev]'
+	$(BIN)/python $(PIP_INSTALL) -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
 	touch $@
 
 $(VENV)/.bench: $(READY)

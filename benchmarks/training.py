@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from idle import IdleVecEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from gym_mara.agents import presets
 from gym_mara.agents.evaluate import make_env
@@ -19,49 +16,11 @@ STEPS = 1_000_000
 SLICES = 5
 
 
-class NothingVecEnv(VecEnv):
-    """Arms that do not move: zeros for observations and rewards, episodes of 2048 steps."""
-
-    def __init__(self, like: VecEnv) -> None:
-        super().__init__(like.num_envs, like.observation_space, like.action_space)
-        self._observation = np.zeros((like.num_envs, *(like.observation_space.shape or ())))
-        self._steps = 0
-
-    def reset(self) -> NDArray[np.float64]:
-        return self._observation.copy()
-
-    def step_async(self, actions: NDArray[np.float32]) -> None:
-        self._steps += 1
-
-    def step_wait(self) -> Any:
-        done = np.full(self.num_envs, self._steps % 2048 == 0)
-        infos: list[dict[str, Any]] = [
-            {"terminal_observation": self._observation[0]} if d else {} for d in done
-        ]
-        rewards = np.zeros(self.num_envs, np.float32)
-        return self._observation.copy(), rewards, done, infos
-
-    def close(self) -> None:
-        """Nothing to free."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [None] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise AttributeError(attr_name)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> list[Any]:
-        raise AttributeError(method_name)
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
-
-
 def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
     """Train both for 1M steps with PPO's preset of this name, slice by slice in turn, and say how the times compare."""
     preset = presets.preset("ppo", name, teleports=True)
     ours = make_env(task, "pinocchio", preset.num_envs, {})
-    models = [new_agent("ppo", preset, env, seed=0) for env in (ours, NothingVecEnv(ours))]
+    models = [new_agent("ppo", preset, env, seed=0) for env in (ours, IdleVecEnv(ours))]
     seconds = [0.0, 0.0]
     for _ in range(SLICES):
         for index, model in enumerate(models):

@@ -8,10 +8,12 @@ CleanRL's own scripts make an id and pass no keyword arguments: an id of one's o
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import gymnasium
 import torch
 from gymnasium.spaces import flatdim
+from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 from torch.distributions import Normal
 
@@ -42,19 +44,19 @@ class Agent(nn.Module):
         return Normal(self.actor(observation), self.log_std.exp())
 
 
-def main() -> None:
-    """Train, and say what a step earns."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env-id", default="MARA-travelling-v0")
-    parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
-    arguments = parser.parse_args()
+def make(env_id: str = "MARA-travelling-v0") -> VectorEnv[Any, Any, Any]:
+    """The arms."""
+    return gymnasium.make_vec(env_id, num_envs=ARMS)
+
+
+def train(envs: VectorEnv[Any, Any, Any], steps: int) -> float:
+    """Train for so many steps over all arms, and return what a step of the last rollout earned."""
     torch.manual_seed(0)
-    envs = gymnasium.make_vec(arguments.env_id, num_envs=ARMS)
     agent = Agent(flatdim(envs.single_observation_space), flatdim(envs.single_action_space))
     optimizer = torch.optim.Adam(agent.parameters(), lr=1e-3)
     observation = torch.as_tensor(envs.reset(seed=0)[0], dtype=torch.float32)
     began = torch.zeros(ARMS)
-    for _ in range(max(1, arguments.steps // (ARMS * ROLLOUT))):
+    for _ in range(max(1, steps // (ARMS * ROLLOUT))):
         rows = []
         for _ in range(ROLLOUT):
             with torch.no_grad():
@@ -97,7 +99,17 @@ def main() -> None:
                 (actor_loss + 0.5 * critic_loss).backward()
                 nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
                 optimizer.step()
-    print(f"reward per step: {rewards.mean().item():.3f}")
+    return float(rewards.mean())
+
+
+def main() -> None:
+    """Train, and say what a step earns."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env-id", default="MARA-travelling-v0")
+    parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
+    arguments = parser.parse_args()
+    envs = make(arguments.env_id)
+    print(f"reward per step: {train(envs, arguments.steps):.3f}")
     envs.close()
 
 

@@ -29,19 +29,19 @@ def rescaled(env: gymnasium.Env) -> gymnasium.Env:  # type: ignore[type-arg]
     return RescaleAction(env, np.float32(-1), np.float32(1))
 
 
-def single() -> gymnasium.Env:  # type: ignore[type-arg]
+def single(env_id: str = ID) -> gymnasium.Env:  # type: ignore[type-arg]
     """One environment."""
-    return rescaled(gymnasium.make(ID))
+    return rescaled(gymnasium.make(env_id))
 
 
-def in_turn() -> VecEnv:
+def in_turn(env_id: str = ID) -> VecEnv:
     """Several, one after the other."""
-    return make_vec_env(ID, n_envs=4, wrapper_class=rescaled)
+    return make_vec_env(env_id, n_envs=4, wrapper_class=rescaled)
 
 
-def in_processes() -> VecEnv:
+def in_processes(env_id: str = ID) -> VecEnv:
     """Several, each in a process of its own."""
-    return make_vec_env(ID, n_envs=2, wrapper_class=rescaled, vec_env_cls=SubprocVecEnv)
+    return make_vec_env(env_id, n_envs=2, wrapper_class=rescaled, vec_env_cls=SubprocVecEnv)
 
 
 def native() -> VecEnv:
@@ -49,12 +49,19 @@ def native() -> VecEnv:
     return MaraVecEnv(MaraVectorEnv(256, "MARA-v0", autoreset_mode="SameStep"))
 
 
-WAYS: dict[str, Callable[[], Any]] = {
+WAYS: dict[str, Callable[..., Any]] = {
     "single": single,
     "in_turn": in_turn,
     "in_processes": in_processes,
     "native": native,
 }
+
+
+def train(env: Any, steps: int) -> PPO:
+    """Train for so many steps over all arms."""
+    rollout = 8 if getattr(env, "num_envs", 1) > 8 else 256
+    model = PPO("MlpPolicy", env, n_steps=rollout, batch_size=256, device="cpu", seed=0)
+    return model.learn(steps)
 
 
 def main() -> None:
@@ -64,9 +71,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100_000)
     arguments = parser.parse_args()
     env = WAYS[arguments.way]()
-    steps = 8 if arguments.way == "native" else 256
-    model = PPO("MlpPolicy", env, n_steps=steps, batch_size=256, device="cpu", seed=0)
-    model.learn(arguments.steps)
+    model = train(env, arguments.steps)
     env.close()
     playing = single()
     observation, info = playing.reset(seed=0)

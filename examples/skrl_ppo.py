@@ -6,29 +6,34 @@ python examples/skrl_ppo.py --steps 50000
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import gymnasium
 import torch
-from skrl.agents.torch.ppo import PPO
-from skrl.envs.wrappers.torch import wrap_env
-from skrl.memories.torch import RandomMemory
-from skrl.trainers.torch import SequentialTrainer
-from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
 
 import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.extras import needs
+
+with needs("this example", "skrl"):
+    from skrl.agents.torch.ppo import PPO
+    from skrl.envs.wrappers.torch import wrap_env
+    from skrl.memories.torch import RandomMemory
+    from skrl.trainers.torch import SequentialTrainer
+    from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
 
 ARMS = 64
 ROLLOUT = 16
 
 
-def main() -> None:
-    """Train, and say what the mean action earns in a first step."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
-    steps = parser.parse_args().steps
+def make(env_id: str = "gym_mara/MARA-v0") -> Any:
+    """The arms, as skrl takes them."""
+    arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
+    return wrap_env(arms, wrapper="gymnasium")
+
+
+def train(env: Any, steps: int) -> PPO:
+    """Train for so many steps over all arms."""
     torch.manual_seed(0)
-    arms = gymnasium.make_vec("gym_mara/MARA-v0", num_envs=ARMS, autoreset_mode="SameStep")
-    env = wrap_env(arms, wrapper="gymnasium")
     network = [{"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}]
     spaces = {
         "observation_space": env.observation_space,
@@ -48,11 +53,22 @@ def main() -> None:
     SequentialTrainer(
         env=env, agents=agent, cfg={"timesteps": max(1, steps // ARMS), "headless": True}
     ).train()
-    observation = torch.as_tensor(arms.reset(seed=0)[0], dtype=torch.float32)
+    return agent
+
+
+def main() -> None:
+    """Train, and say what the mean action earns in a first step."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
+    env = make()
+    agent = train(env, parser.parse_args().steps)
+    observation, _ = env.reset()
     with torch.no_grad():
-        _, outputs = models["policy"].act({"observations": observation}, role="policy")
-    _, reward, _, _, _ = arms.step(outputs["mean_actions"].numpy())
-    print(f"reward per step: {reward.mean():.3f}")
+        _, outputs = agent.models["policy"].act(
+            {"observations": observation.float()}, role="policy"
+        )
+    _, reward, *_ = env.step(outputs["mean_actions"])
+    print(f"reward per step: {reward.mean().item():.3f}")
     env.close()
 
 

@@ -12,30 +12,33 @@ import argparse
 
 import gymnasium
 import torch
-from gymnasium.spaces import flatdim
-from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.envs import DoubleToFloat, GymWrapper, TransformedEnv
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.extras import needs
+
+with needs("this example", "torchrl"):
+    from tensordict.nn import NormalParamExtractor, TensorDictModule
+    from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
+    from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+    from torchrl.objectives import ClipPPOLoss
+    from torchrl.objectives.value import GAE
 
 ARMS = 64
 ROLLOUT = 16
 
 
-def main() -> None:
-    """Train, and say what a step earns."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
-    updates = max(1, parser.parse_args().steps // (ARMS * ROLLOUT))
+def make(env_id: str = "gym_mara/MARA-v0") -> EnvBase:
+    """The arms, as TorchRL takes them."""
+    arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
+    return TransformedEnv(GymWrapper(arms), DoubleToFloat(in_keys=["observation"]))
+
+
+def train(env: EnvBase, steps: int) -> float:
+    """Train for so many steps over all arms, and return what a step of the last rollout earned."""
     torch.manual_seed(0)
-    arms = gymnasium.make_vec("gym_mara/MARA-v0", num_envs=ARMS, autoreset_mode="SameStep")
-    inputs = flatdim(arms.single_observation_space)
-    outputs = flatdim(arms.single_action_space)
-    env = TransformedEnv(GymWrapper(arms), DoubleToFloat(in_keys=["observation"]))
+    inputs = env.observation_spec["observation"].shape[-1]
+    outputs = env.action_spec.shape[-1]
     network = nn.Sequential(
         nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 2 * outputs), NormalParamExtractor()
     )
@@ -51,7 +54,7 @@ def main() -> None:
     loss = ClipPPOLoss(actor, critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     now = env.reset()
-    for _ in range(updates):
+    for _ in range(max(1, steps // (ARMS * ROLLOUT))):
         with torch.no_grad():
             rollout = env.rollout(
                 ROLLOUT, actor, tensordict=now, auto_reset=False, break_when_any_done=False
@@ -65,7 +68,15 @@ def main() -> None:
             total.backward()
             nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
             optimizer.step()
-    print(f"reward per step: {rollout['next', 'reward'].mean().item():.3f}")
+    return float(rollout["next", "reward"].mean())
+
+
+def main() -> None:
+    """Train, and say what a step earns."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
+    env = make()
+    print(f"reward per step: {train(env, parser.parse_args().steps):.3f}")
     env.close()
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
+
+from tests.helpers import ENV_IDS
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CALLS = {
@@ -19,19 +23,66 @@ CALLS = {
     "cleanrl_ppo.py --env-id gym_mara/MARARandomTarget-v0": "reward per step",
     "skrl_ppo.py": "reward per step",
     "torchrl_ppo.py": "reward per step",
+    "tianshou_ppo.py": "reward per step",
+    "sbx_ppo.py": "position error",
 }
+ELSEWHERE = {"rllib_ppo.py"}
+"""What `make test-rllib` runs, in an environment of its own."""
+ZOO = "--env gym_mara/MARA-v0 --gym-packages gym_mara --n-timesteps 600 --log-folder logs"
 
 
 def test_no_example_is_forgotten() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {call.split()[0] for call in CALLS}
+    scripts = {path.name for path in EXAMPLES.glob("*.py")}
+    assert scripts == {call.split()[0] for call in CALLS} | ELSEWHERE
 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_an_example_runs(call: str, tmp_path: Path) -> None:
     script, *arguments = call.split()
-    command = [sys.executable, str(EXAMPLES / script), *arguments, "--steps", "600"]
-    done = subprocess.run(
-        command, check=False, capture_output=True, text=True, cwd=tmp_path, timeout=300
+    printed = _run(str(EXAMPLES / script), *arguments, "--steps", "600", cwd=tmp_path)
+    assert CALLS[call] in printed
+
+
+@pytest.mark.parametrize("algo", ["ppo", "trpo", "acktr"])
+def test_the_zoo_trains_and_plays(algo: str, tmp_path: Path) -> None:
+    folder = EXAMPLES / "rl_zoo3"
+    zoo = ["-m", "rl_zoo3.train"] if algo == "ppo" else [str(folder / "zoo.py"), "train"]
+    _run(*zoo, *f"--algo {algo} {ZOO} --conf-file {folder / algo}.yml".split(), cwd=tmp_path)
+    played = f"enjoy --algo {algo} --env gym_mara/MARA-v0 -f logs --no-render -n 100"
+    _run(str(folder / "zoo.py"), *played.split(), cwd=tmp_path)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "trpo", "acktr"])
+def test_the_zoo_knows_the_papers_four_environments(algo: str) -> None:
+    known = yaml.safe_load((EXAMPLES / "rl_zoo3" / f"{algo}.yml").read_text())
+    assert set(known) == set(ENV_IDS)
+
+
+def test_a_backend_from_another_package_passes_the_contract(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package, site = tmp_path / "mujoco_backend", tmp_path / "site"
+    shutil.copytree(EXAMPLES / "mujoco_backend", package)  # building leaves files in the source
+    pip = "-m pip install -q --no-deps --no-build-isolation --disable-pip-version-check --target"
+    _run(*pip.split(), str(site), str(package), cwd=tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    assert "mujoco" in _run("-m", "gym_mara.cli", "list", cwd=tmp_path)
+    train = "train --env MARA-v0 --backend mujoco --steps 512 --out run"
+    _run("-m", "gym_mara.cli", *train.split(), cwd=tmp_path)
+    assert " passed" in _run(
+        "-m", "pytest", "-q", "-p", "no:cacheprovider", str(package), cwd=tmp_path
     )
-    assert done.returncode == 0, done.stderr
-    assert CALLS[call] in done.stdout
+
+
+def _run(*arguments: str, cwd: Path) -> str:
+    """What Python prints with these arguments; it must end well."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout

@@ -1,0 +1,66 @@
+"""PPO of sbx, Stable-Baselines3 on JAX, on hundreds of arms in one batch.
+
+python examples/sbx_ppo.py --steps 100000
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.envs import MaraVectorEnv
+from gym_mara.extras import needs
+
+with needs("this example", "sbx"):
+    from sbx import PPO
+
+ARMS = 256
+ROLLOUT = 8
+
+
+def make(env_id: str = "gym_mara/MARA-v0") -> VecEnv:
+    """The arms; their actions are rescaled to [-1, 1], and observations in float64 become float32 in JAX."""
+    arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
+    return MaraVecEnv(cast(MaraVectorEnv, arms))
+
+
+def train(env: VecEnv, steps: int) -> Any:
+    """Train for so many steps over all arms, and return the model."""
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=ROLLOUT,
+        batch_size=512,
+        n_epochs=5,
+        gamma=0.9,
+        learning_rate=lambda remaining: 3e-3 * remaining,
+        policy_kwargs={"log_std_init": -2.0},
+        seed=0,
+    )
+    return model.learn(steps)
+
+
+def main() -> None:
+    """Train, and say how far the deterministic policy ends from the target."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
+    steps = parser.parse_args().steps
+    env = make()
+    model = train(env, steps)
+    observation = env.reset()
+    for _ in range(100):
+        action, _ = model.predict(observation, deterministic=True)
+        observation, _, _, _ = env.step(action)
+    error = (np.asarray(observation)[0, 6:9] ** 2).sum() ** 0.5
+    print(f"position error: {1000 * error:.1f} mm")
+    env.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""PPO of Tianshou 2 on the native vector environment, through a small adapter.
+
+Tianshou steps vector environments of its own, and resets by itself those whose episodes have ended: with
+autoreset_mode="Disabled" ours does just what it wants.
+
+    python examples/tianshou_ppo.py --steps 100000
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import flatdim
+from numpy.typing import NDArray
+from torch import nn
+from torch.distributions import Distribution, Independent, Normal
+
+import gym_mara  # noqa: F401 - registers the environments
+from gym_mara.extras import needs
+
+with needs("this example", "tianshou"):
+    from tianshou.algorithm import PPO
+    from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+    from tianshou.algorithm.optim import AdamOptimizerFactory
+    from tianshou.data import Batch, Collector, VectorReplayBuffer
+    from tianshou.env import BaseVectorEnv
+    from tianshou.trainer import OnPolicyTrainerParams
+    from tianshou.utils.net.common import Net
+    from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
+
+ARMS = 64
+ROLLOUT = 8
+
+
+class NativeVectorEnv(BaseVectorEnv):  # type: ignore[misc]
+    """A Gymnasium vector environment that resets nothing by itself, as Tianshou's collector wants it.
+
+    Steps are always of all arms: collect steps (`n_step`), not episodes. What the environment says in `info` is left out.
+    """
+
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        # Not the base's: it would make one Python worker per arm.
+        self.env, self.env_num, self.is_async, self.is_closed = env, env.num_envs, False, False
+
+    def get_env_attr(self, key: str, id: Any = None) -> list[Any]:  # noqa: A002 - Tianshou's name
+        """What every arm has: single_action_space for action_space, and so on."""
+        return [getattr(self.env, f"single_{key}")] * self.env_num
+
+    def reset(self, env_id: Any = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
+        """Begin episodes, of all arms or of some."""
+        arms = np.arange(self.env_num)[slice(None) if env_id is None else env_id]
+        mask = np.isin(np.arange(self.env_num), arms)
+        observation, _ = self.env.reset(options={"reset_mask": mask}, **kwargs)
+        return observation[arms], np.array([{} for _ in arms])
+
+    def step(self, action: Any, id: Any = None) -> Any:  # noqa: A002
+        """Move every arm."""
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward, terminated, truncated, np.array([{}] * self.env_num)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+        self.is_closed = True
+
+
+def make(env_id: str = "gym_mara/MARA-v0") -> NativeVectorEnv:
+    """The arms in one batch."""
+    return NativeVectorEnv(gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="Disabled"))
+
+
+def gaussian(loc_scale: tuple[torch.Tensor, torch.Tensor]) -> Distribution:
+    """The distribution of the actions, [-1, 1] of each joint's range."""
+    return Independent(Normal(*loc_scale), 1)
+
+
+def train(env: NativeVectorEnv, steps: int) -> ProbabilisticActorPolicy:
+    """Train for so many steps over all arms, and return the policy."""
+    torch.manual_seed(0)
+    observations, actions = (
+        env.get_env_attr("observation_space")[0],
+        env.get_env_attr("action_space")[0],
+    )
+    network = {
+        "state_shape": flatdim(observations),
+        "hidden_sizes": [64, 64],
+        "activation": nn.Tanh,
+    }
+    actor = ContinuousActorProbabilistic(
+        preprocess_net=Net(**network), action_shape=actions.shape, unbounded=True
+    )
+    nn.init.constant_(actor.sigma_param, -2.0)
+    policy = ProbabilisticActorPolicy(
+        actor=actor, dist_fn=gaussian, action_space=actions, deterministic_eval=True
+    )
+    rate = AdamOptimizerFactory(lr=3e-3)
+    algorithm = PPO(
+        policy=policy,
+        critic=ContinuousCritic(preprocess_net=Net(**network)),
+        optim=rate,
+        gamma=0.9,
+        ent_coef=0.0,
+        max_grad_norm=0.5,
+    )
+    rollout = ARMS * ROLLOUT
+    algorithm.run_training(
+        OnPolicyTrainerParams(
+            training_collector=Collector(policy, env, VectorReplayBuffer(rollout, ARMS)),
+            max_epochs=1,
+            epoch_num_steps=steps,
+            collection_step_num_env_steps=rollout,
+            batch_size=128,
+            update_step_num_repetitions=5,
+            verbose=False,
+            show_progress=False,
+        )
+    )
+    return policy
+
+
+def main() -> None:
+    """Train, and say what the mean action earns in a first step."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
+    steps = parser.parse_args().steps
+    env = make()
+    policy = train(env, steps)
+    observation, _ = env.reset()
+    with torch.no_grad():
+        action = policy.map_action(policy(Batch(obs=observation, info=Batch())).act)
+    _, reward, _, _, _ = env.step(action)
+    print(f"reward per step: {reward.mean():.3f}")
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
