@@ -21,7 +21,7 @@ with needs("this example", "sbx"):
     from sbx import PPO
 
 ARMS = 256
-ROLLOUT = 8
+ROLLOUT = 2
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> VecEnv:
@@ -36,11 +36,11 @@ def train(env: VecEnv, steps: int) -> Any:
         "MlpPolicy",
         env,
         n_steps=ROLLOUT,
-        batch_size=512,
+        batch_size=128,
         n_epochs=5,
         gamma=0.9,
         learning_rate=lambda remaining: 3e-3 * remaining,
-        policy_kwargs={"log_std_init": -2.0},
+        policy_kwargs={"log_std_init": -2.0, "ortho_init": True},  # sbx has no ortho_init by itself
         seed=0,
     )
     return model.learn(steps)

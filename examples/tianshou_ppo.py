@@ -25,7 +25,7 @@ from gym_mara.extras import needs
 with needs("this example", "tianshou"):
     from tianshou.algorithm import PPO
     from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
-    from tianshou.algorithm.optim import AdamOptimizerFactory
+    from tianshou.algorithm.optim import AdamOptimizerFactory, LRSchedulerFactoryLinear
     from tianshou.data import Batch, Collector, VectorReplayBuffer
     from tianshou.env import BaseVectorEnv
     from tianshou.trainer import OnPolicyTrainerParams
@@ -97,16 +97,18 @@ def train(env: NativeVectorEnv, steps: int) -> ProbabilisticActorPolicy:
     policy = ProbabilisticActorPolicy(
         actor=actor, dist_fn=gaussian, action_space=actions, deterministic_eval=True
     )
-    rate = AdamOptimizerFactory(lr=3e-3)
+    rollout = ARMS * ROLLOUT
+    adam = AdamOptimizerFactory(lr=3e-3).with_lr_scheduler_factory(
+        LRSchedulerFactoryLinear(1, steps, rollout)
+    )
     algorithm = PPO(
         policy=policy,
         critic=ContinuousCritic(preprocess_net=Net(**network)),
-        optim=rate,
-        gamma=0.9,
+        optim=adam,
+        gamma=0.0,  # what comes next hangs on the action alone
         ent_coef=0.0,
         max_grad_norm=0.5,
     )
-    rollout = ARMS * ROLLOUT
     algorithm.run_training(
         OnPolicyTrainerParams(
             training_collector=Collector(policy, env, VectorReplayBuffer(rollout, ARMS)),
