@@ -23,6 +23,8 @@ ID = "gym_mara:gym_mara/MARA-v0"
 """With the module in front, so that the env runners, processes of their own, find it too."""
 ARMS = 32
 BATCH = 2048
+PATIENCE = 60
+"""Iterations; some seconds long where every env runner is gone."""
 
 
 def config(env_id: str = ID, env_runners: int = 2) -> PPOConfig:
@@ -67,10 +69,17 @@ def train(config: PPOConfig, steps: int) -> float:
     ).close()
     algorithm = config.build_algo()
     try:
-        sampled, reward = 0, float("nan")
+        sampled, reward, without = 0, float("nan"), 0
         while sampled < steps:
             result = algorithm.train()["env_runners"]
-            sampled, reward = result["num_env_steps_sampled_lifetime"], result["reward_per_step"]
+            before, sampled = sampled, result["num_env_steps_sampled_lifetime"]
+            reward = result["reward_per_step"]
+            # Env runners that died are begun anew; RLlib would wait for ever for ones that cannot.
+            without = without + 1 if sampled == before else 0
+            if without == PATIENCE:
+                raise RuntimeError(
+                    f"the env runners took no step in {PATIENCE} iterations: see Ray's log"
+                )
         return float(reward)
     finally:
         algorithm.stop()

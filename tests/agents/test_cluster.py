@@ -15,10 +15,11 @@ import psutil
 import pytest
 import ray
 
-from gym_mara.agents.benchmark import Grid, read_result, run_grid
+from gym_mara.agents.benchmark import Grid, read_result, run_grid, run_one
 from gym_mara.agents.cluster import run_on_ray
 from gym_mara.agents.parallel import Say, run_tasks
 from gym_mara.backends.workers import choose_workers
+from gym_mara.cli.experiments import _engine
 from gym_mara.errors import GymMaraError
 
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=8192, checkpoint_every=2048)
@@ -111,3 +112,26 @@ def test_a_cluster_that_is_not_there_is_told(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "there is no Ray cluster at '127.0.0.1:1'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("engine", "jobs", "address", "reason"),
+    [
+        ("cloud", None, None, "unknown engine 'cloud'.*local, ray"),
+        ("ray", 2, None, "--jobs counts processes of this machine"),
+        ("local", None, "somewhere:6379", "give --engine ray too"),
+    ],
+)
+def test_options_that_contradict_each_other_are_told(
+    engine: str, jobs: int | None, address: str | None, reason: str
+) -> None:
+    with pytest.raises(GymMaraError, match=reason):
+        _engine(engine, jobs, address)
+
+
+def test_a_machine_that_does_not_find_the_grid_says_so(tmp_path: Path) -> None:
+    name, config = next(iter(GRID.runs().items()))
+    with pytest.raises(
+        GymMaraError, match="does not find the grid.*storage that all machines share"
+    ):
+        run_one(tmp_path / "elsewhere" / name, config, print)
