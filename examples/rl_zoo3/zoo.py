@@ -1,36 +1,34 @@
-"""rl_zoo3 with ACKTR among its algorithms: train, enjoy, plot_train, plot_from_file and all_plots, as rl_zoo3 has them.
+"""RL Baselines3 Zoo with ACKTR among its algorithms; everything else is its own.
 
-python examples/rl_zoo3/zoo.py train --algo acktr --env gym_mara/MARA-v0 --gym-packages gym_mara \
-    --conf-file examples/rl_zoo3/acktr.yml -f logs
-python examples/rl_zoo3/zoo.py enjoy --algo acktr --env gym_mara/MARA-v0 --gym-packages gym_mara -f logs
+python examples/rl_zoo3/zoo.py train --algo acktr --env gym_mara/MARA-v0 --conf-file examples/rl_zoo3/acktr.yml -f /tmp/zoo
+python examples/rl_zoo3/zoo.py enjoy --algo acktr --env gym_mara/MARA-v0 -f /tmp/zoo --no-render -n 2048
 """
 
 from __future__ import annotations
 
-from typing import Any
+import sys
 
-import optuna
-from rl_zoo3 import ALGOS
-from rl_zoo3.cli import main
-from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-
+import gym_mara  # noqa: F401 - registers the environments, as --gym-packages does
 from gym_mara.agents.acktr import ACKTR
+from gym_mara.extras import needs
 
+with needs("this example", "zoo"):
+    from rl_zoo3 import ALGOS
+    from rl_zoo3.enjoy import enjoy
+    from rl_zoo3.train import train
 
-def sample(trial: optuna.Trial, *_: Any) -> dict[str, Any]:
-    """What --optimize-hyperparameters varies of ACKTR; the rest is as in the configuration file."""
-    return {
-        "learning_rate": trial.suggest_float("learning_rate", 1e-2, 1.0, log=True),
-        "target_kl": trial.suggest_float("target_kl", 3e-4, 3e-2, log=True),
-        "damping": trial.suggest_float("damping", 1e-3, 1e-1, log=True),
-        "n_steps": trial.suggest_categorical("n_steps", [8, 16, 32, 64]),
-    }
-
-
-# rl_zoo3's scripts share these three.
+# All modules of the zoo hold this one dictionary: it is added to, not replaced.
 ALGOS["acktr"] = ACKTR
-HYPERPARAMS_SAMPLER["acktr"] = sample
-HYPERPARAMS_CONVERTER["acktr"] = dict
+
+
+def main() -> None:
+    """Run the zoo's own command."""
+    # Not by rl_zoo3.cli, which wants the libraries of the zoo's plots as well.
+    commands = {"train": train, "enjoy": enjoy}
+    if sys.argv[1:2] == [] or sys.argv[1] not in commands:
+        sys.exit(f"usage: zoo.py {'|'.join(commands)} …")
+    commands[sys.argv.pop(1)]()
+
 
 if __name__ == "__main__":
     main()

@@ -132,6 +132,6 @@ def test_options_that_contradict_each_other_are_told(
 def test_a_machine_that_does_not_find_the_grid_says_so(tmp_path: Path) -> None:
     name, config = next(iter(GRID.runs().items()))
     with pytest.raises(
-        GymMaraError, match="does not find the grid.*storage that all machines share"
+        GymMaraError, match=r"does not find the grid.*storage that all machines share"
     ):
         run_one(tmp_path / "elsewhere" / name, config, print)
