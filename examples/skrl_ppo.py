@@ -23,6 +23,7 @@ with needs("this example", "skrl"):
 
 ARMS = 64
 ROLLOUT = 16
+SETTLING = 20
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> Any:
@@ -57,17 +58,18 @@ def train(env: Any, steps: int) -> PPO:
 
 
 def main() -> None:
-    """Train, and say what the mean action earns in a first step."""
+    """Train, and say what the mean action earns in a step once the arms have settled."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
     env = make()
     agent = train(env, parser.parse_args().steps)
     observation, _ = env.reset()
-    with torch.no_grad():
-        _, outputs = agent.models["policy"].act(
-            {"observations": observation.float()}, role="policy"
-        )
-    _, reward, *_ = env.step(outputs["mean_actions"])
+    # The policy has hardly seen the start pose, where an episode of 2048 steps is but once.
+    for _ in range(SETTLING):
+        with torch.no_grad():
+            seen = {"observations": observation.float()}
+            _, outputs = agent.models["policy"].act(seen, role="policy")
+        observation, reward, *_ = env.step(outputs["mean_actions"])
     print(f"reward per step: {reward.mean().item():.3f}")
     env.close()
 
