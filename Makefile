@@ -23,7 +23,6 @@ bench: $(VENV)/.bench ## Measure speed against the floor and against peers; some
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/dynamics.py
 	$(BIN)/python benchmarks/rendering.py
-	$(BIN)/python benchmarks/libraries.py
 
 experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
 	$(BIN)/gym-mara benchmark --out runs/experiment

@@ -24,7 +24,7 @@ from pathlib import Path
 EXAMPLES = Path(__file__).parents[1] / "examples"
 HERE = str(Path(__file__).parent)
 OURS, IDLE = "gym_mara:gym_mara/MARA-v0", "idle:idle/MARA-v0"
-ROUNDS = 3
+ROUNDS = 2
 
 Job = Callable[[], object]
 
@@ -59,7 +59,7 @@ def through_zoo(algo: str, steps: int) -> Callable[[str], Job]:
         zoo = importlib.import_module("zoo")
         folder = Path(tempfile.mkdtemp())
         config = (EXAMPLES / "rl_zoo3" / f"{algo}.yml").read_text()
-        (folder / "config.yml").write_text(config + "\nidle/MARA-v0: *mara\n")
+        (folder / "config.yml").write_text(config + f"\nidle/MARA-v0: *{algo}\n")
         options = ["--algo", algo, "--env", env_id.partition(":")[2], "-n", str(steps)]
         options += ["--conf-file", str(folder / "config.yml"), "-f", str(folder)]
         options += ["--eval-freq", "-1", "--verbose", "0", "--seed", "0"]
@@ -84,23 +84,22 @@ def through_rllib(steps: int) -> Callable[[str], Job]:
 
 
 LIBRARIES: dict[str, tuple[str, Callable[[str], Job]]] = {
-    "Stable-Baselines3, one": ("stable_baselines3", through_example("sb3_ppo", 8192, "single")),
+    "Stable-Baselines3, one": ("stable_baselines3", through_example("sb3_ppo", 4096, "single")),
     "Stable-Baselines3, in turn": (
         "stable_baselines3",
-        through_example("sb3_ppo", 8192, "in_turn"),
+        through_example("sb3_ppo", 4096, "in_turn"),
     ),
     "Stable-Baselines3, SubprocVecEnv": (
         "stable_baselines3",
-        through_example("sb3_ppo", 8192, "in_processes"),
+        through_example("sb3_ppo", 4096, "in_processes"),
     ),
     "Stable-Baselines3, native": ("stable_baselines3", through_batch("sb3_ppo", 65536, "native")),
-    "rl_zoo3, PPO": ("rl_zoo3", through_zoo("ppo", 16384)),
-    "rl_zoo3, ACKTR": ("rl_zoo3", through_zoo("acktr", 16384)),
+    "rl_zoo3, PPO": ("rl_zoo3", through_zoo("ppo", 8192)),
+    "rl_zoo3, ACKTR": ("rl_zoo3", through_zoo("acktr", 8192)),
     "CleanRL's style": ("torch", through_example("cleanrl_ppo", 65536)),
     "skrl": ("skrl", through_example("skrl_ppo", 32768)),
-    "TorchRL": ("torchrl", through_example("torchrl_ppo", 32768)),
     "Tianshou": ("tianshou", through_example("tianshou_ppo", 32768)),
-    "sbx": ("sbx-rl", through_batch("sbx_ppo", 131072)),
+    "sbx": ("sbx-rl", through_batch("sbx_ppo", 65536)),
 }
 RLLIB = {"RLlib": ("ray", through_rllib(40_000))}
 
