@@ -16,7 +16,7 @@ from gym_mara_mujoco import MujocoBackend, build_model
 
 from gym_mara.backends import make_backend
 from gym_mara.envs import MaraEnv
-from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import make_checker
 from gym_mara.testing import BackendContract, Make, uniform_q
@@ -57,12 +57,9 @@ def slider(tmp_path: Path) -> RobotModel:
 
 @pytest.fixture(params=["mara", "slider", "ur5"])
 def robot(request: pytest.FixtureRequest) -> RobotModel:
-    if request.param != "ur5":
-        return request.getfixturevalue(request.param)  # type: ignore[no-any-return]
-    try:
+    if request.param == "ur5":
         return RobotModel.load("ur5")  # of meshes
-    except MissingExtraError as error:
-        pytest.skip(str(error))
+    return request.getfixturevalue(request.param)  # type: ignore[no-any-return]
 
 
 class TestContract(BackendContract):
