@@ -75,12 +75,11 @@ def run_on_ray(tasks: Mapping[str, Task], hear: Hear, address: str | None = None
                 name = running.pop(reference)
                 try:
                     reason = ray.get(reference)
-                except (
-                    RayTaskError
-                ) as error:  # before the task itself began: gym_mara is not there, say
+                except RayTaskError as error:
+                    # Before the task itself began: gym_mara is not there, say.
                     reason = f"its machine could not begin it: {error.cause or error}"
                 except RayError as error:
-                    reason = f"its process or machine died {TRIES + 1} times: {error}"
+                    reason = f"Ray gave it up: {error}"
                 if reason is not None:
                     failed[name] = reason
         for name, message in ray.get(mailbox.take.remote()):
