@@ -13,6 +13,7 @@ from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import (
     CoalChecker,
+    CollisionChecker,
     ParallelCoalChecker,
     RememberingChecker,
     make_checker,
@@ -65,10 +66,12 @@ class PinocchioBackend(Backend):
             self.joint_velocity = np.full(robot.num_joints, velocity)
         self.path_resolution = positive_number("path_resolution", path_resolution, "m")
         self._checker = make_checker(collision, robot, collision_threads)
-        if (
-            self.teleports
-            and num_envs >= REMEMBER_FROM
-            and isinstance(self._checker, (CoalChecker, ParallelCoalChecker))
+        self._with_room: CollisionChecker | None = None
+        if self.max_joint_velocity is not None:
+            half = np.full(robot.num_joints, 0.5 * self.max_joint_velocity * self.control_period)
+            self._with_room = self._checker.with_room(half)
+        elif num_envs >= REMEMBER_FROM and isinstance(
+            self._checker, (CoalChecker, ParallelCoalChecker)
         ):
             self._checker = RememberingChecker(robot, self._checker)
         self._kinematics = robot.kinematics()
@@ -98,18 +101,26 @@ class PinocchioBackend(Backend):
 
     def _travel(self, q_target: Floats, velocity: float) -> None:
         """Move along the path of one period, as far as the first collision on it."""
-        way = q_target - self._q
-        length = (np.minimum(np.abs(way), velocity * self.control_period) * self.robot.reach).sum(1)
+        way, furthest = q_target - self._q, velocity * self.control_period
+        length = (np.minimum(np.abs(way), furthest) * self.robot.reach).sum(1)
         samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
+        free = np.zeros(self.num_envs, np.bool_)
+        if self._with_room is not None:
+            # Where there is room around the middle of a path, all of it is free.
+            long = samples > 1
+            middle = self._q[long] + 0.5 * np.clip(way[long], -furthest, furthest)
+            free[long] = ~self._with_room.check(middle)
+            samples[free] = 1
         # The samples of all paths in one array, an arm's behind another's: which arm, and which of its samples.
         arm = np.repeat(np.arange(self.num_envs), samples)
         last = np.cumsum(samples) - 1
         sample = np.arange(1, len(arm) + 1) - (last - samples + 1)[arm]
-        limit = (velocity * self.control_period * sample / samples[arm])[:, None]
+        limit = (furthest * (sample / samples[arm]))[:, None]
         path = self._q[arm] + np.clip(way[arm], -limit, limit)
         arrived = np.abs(way[arm]) <= limit * (1.0 + 1e-9)
         path[arrived] = q_target[arm][arrived]  # exactly there, not nearly
-        hit = self._checker.check(path)
+        hit, unsure = np.zeros(len(arm), np.bool_), ~free[arm]
+        hit[unsure] = self._checker.check(path[unsure])
         first_hit = np.minimum.reduceat(
             np.where(hit, np.arange(len(arm)), len(arm)), last - samples + 1
         )

@@ -23,6 +23,13 @@ class CollisionChecker(ABC):
     def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether any pair touches, (N,), at each of the configurations q (N, J), rad."""
 
+    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker | None:
+        """A checker for which pairs touch already that could meet while no joint moves further than `displacement` (J,), rad.
+
+        None where the engine cannot tell.
+        """
+        return None
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Engines' objects do not pickle; the robot says it all.
         return type(self), (self.robot,)
@@ -93,6 +100,9 @@ class CoalChecker(CollisionChecker):
         )
         return np.array([check(model, data, manager, row, True) for row in q], dtype=np.bool_)
 
+    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+        return CoalChecker(self.robot, displacement)
+
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._displacement)
 
@@ -133,6 +143,9 @@ class ParallelCoalChecker(CollisionChecker):
         result = pin.computeCollisionsInParallel(self._threads, self._pool, q.T, True, False)
         return np.asarray(result, dtype=np.bool_).reshape(len(q))
 
+    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+        return CoalChecker(self.robot, displacement)
+
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._threads)
 
@@ -142,6 +155,9 @@ class NoChecker(CollisionChecker):
 
     def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         return np.zeros(len(q), dtype=np.bool_)
+
+    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+        return self
 
 
 class RememberingChecker(CollisionChecker):

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from gym_mara.backends.pinocchio import PinocchioBackend
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import make_checker
-from gym_mara.testing import COLLIDING_Q, uniform_q
+from gym_mara.testing import COLLIDING_Q, assert_same_state, uniform_q
 from tests.helpers import PATH_ENDS, Floats, robot_model
 
 VELOCITY, PERIOD = 0.5, 0.02
@@ -166,6 +167,40 @@ def test_at_the_contact_the_arm_can_go_back() -> None:
 def test_without_a_checker_nothing_collides() -> None:
     backend = _backend(collision="none")
     assert not backend.step(np.array([COLLIDING_Q])).collided[0]
+
+
+@pytest.mark.parametrize("name", ["mara", "ur5", "panda"])
+def test_to_look_for_room_around_a_path_changes_no_answer(name: str) -> None:
+    robot, rng = robot_model(name), np.random.default_rng(0)
+    backend, sampling = (PinocchioBackend(robot, 32, max_joint_velocity=1.57) for _ in range(2))
+    sampling._with_room = None
+    counts = [_count_checks(each) for each in (backend, sampling)]
+    hits = 0
+    for period in range(60):
+        if period % 20 == 0:
+            start, target = uniform_q(robot, 32, period), uniform_q(robot, 32, period + 1)
+            for each in (backend, sampling):
+                each.reset(start)
+        if period % 20 == 15:  # some arms rest, near where they are
+            target = backend.state.q + rng.uniform(-0.01, 0.01, target.shape)
+            target = target.clip(robot.lower, robot.upper)
+        state = backend.step(target)
+        assert_same_state(state, sampling.step(target))
+        hits += int(state.collided.sum())
+    assert 0 < hits < 60 * 32
+    assert sum(counts[0]) < 0.7 * sum(counts[1]), "it spares something"
+
+
+def _count_checks(backend: PinocchioBackend) -> list[int]:
+    """How many configurations the backend's exact checker is asked about, call by call."""
+    counts, check = [], backend._checker.check
+
+    def counted(q: Floats) -> NDArray[np.bool_]:
+        counts.append(len(q))
+        return check(q)
+
+    backend._checker.check = counted  # type: ignore[method-assign]
+    return counts
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
