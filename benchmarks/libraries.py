@@ -21,10 +21,12 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
+import yaml
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 HERE = str(Path(__file__).parent)
 OURS, IDLE = "gym_mara:gym_mara/MARA-v0", "idle:idle/MARA-v0"
-ROUNDS = 2
+ROUNDS = 3
 
 Job = Callable[[], object]
 
@@ -58,8 +60,9 @@ def through_zoo(algo: str, steps: int) -> Callable[[str], Job]:
     def of(env_id: str) -> Job:
         zoo = importlib.import_module("zoo")
         folder = Path(tempfile.mkdtemp())
-        config = (EXAMPLES / "rl_zoo3" / f"{algo}.yml").read_text()
-        (folder / "config.yml").write_text(config + f"\nidle/MARA-v0: *{algo}\n")
+        config = yaml.safe_load((EXAMPLES / "rl_zoo3" / f"{algo}.yml").read_text())
+        config["idle/MARA-v0"] = config["gym_mara/MARA-v0"] | {"vec_env_wrapper": None}
+        (folder / "config.yml").write_text(yaml.safe_dump(config))
         options = ["--algo", algo, "--env", env_id.partition(":")[2], "-n", str(steps)]
         options += ["--conf-file", str(folder / "config.yml"), "-f", str(folder)]
         options += ["--eval-freq", "-1", "--verbose", "0", "--seed", "0"]
@@ -94,11 +97,11 @@ LIBRARIES: dict[str, tuple[str, Callable[[str], Job]]] = {
         through_example("sb3_ppo", 4096, "in_processes"),
     ),
     "Stable-Baselines3, native": ("stable_baselines3", through_batch("sb3_ppo", 65536, "native")),
-    "rl_zoo3, PPO": ("rl_zoo3", through_zoo("ppo", 8192)),
-    "rl_zoo3, ACKTR": ("rl_zoo3", through_zoo("acktr", 8192)),
+    "rl_zoo3, PPO": ("rl_zoo3", through_zoo("ppo", 65536)),
+    "rl_zoo3, ACKTR": ("rl_zoo3", through_zoo("acktr", 65536)),
     "CleanRL's style": ("torch", through_example("cleanrl_ppo", 65536)),
-    "skrl": ("skrl", through_example("skrl_ppo", 32768)),
-    "Tianshou": ("tianshou", through_example("tianshou_ppo", 32768)),
+    "skrl": ("skrl", through_example("skrl_ppo", 65536)),
+    "Tianshou": ("tianshou", through_example("tianshou_ppo", 65536)),
     "sbx": ("sbx-rl", through_batch("sbx_ppo", 65536)),
 }
 RLLIB = {"RLlib": ("ray", through_rllib(40_000))}

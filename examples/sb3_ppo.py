@@ -58,9 +58,10 @@ WAYS: dict[str, Callable[..., Any]] = {
 
 
 def train(env: Any, steps: int) -> PPO:
-    """Train for so many steps over all arms."""
-    rollout = 8 if getattr(env, "num_envs", 1) > 8 else 256
-    model = PPO("MlpPolicy", env, n_steps=rollout, batch_size=256, device="cpu", seed=0)
+    """Train for so many steps over all arms: with the library's own settings, but for hundreds of arms larger batches."""
+    arms = getattr(env, "num_envs", 1)
+    settings = {"batch_size": 256} if arms > 8 else {}
+    model = PPO("MlpPolicy", env, n_steps=2048 // arms, device="cpu", seed=0, **settings)
     return model.learn(steps)
 
 

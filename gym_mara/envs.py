@@ -233,8 +233,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         Raises:
             GymMaraError: the actions have the wrong shape or are not finite; no arm has moved then.
         """
-        resetting = self._ended.copy()
-        if resetting.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+        resetting = self._ended
+        some_reset = bool(np.count_nonzero(resetting))
+        if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
             raise GymMaraError(
                 "episodes have ended: reset them, reset(options={'reset_mask': …}), before the next step"
             )
@@ -243,15 +244,15 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         truncated = self.simulation.statistics.steps == self.max_episode_steps
         if outcome.truncated is not None:
             truncated |= outcome.truncated
-        if resetting.any():  # NEXT_STEP: these began an episode instead of stepping
+        if some_reset:  # NEXT_STEP: these began an episode instead of stepping
             observation[resetting] = self._reset(resetting)[resetting]
             reward[resetting] = 0.0
             terminated, truncated = terminated & ~resetting, truncated & ~resetting
         ended = terminated | truncated
         info = _vector_info(outcome.info, ~resetting)
-        if resetting.any():
+        if some_reset:
             self._report_beginning(info, resetting)
-        if ended.any():
+        if np.count_nonzero(ended):
             info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = np.full(self.num_envs, None, dtype=object)
@@ -328,10 +329,13 @@ def _info_of_one(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Gymnasium's form of a batch of infos: a mask `_key` beside each key says which arms it speaks of."""
     info: dict[str, Any] = {}
+    all_arms = np.count_nonzero(mask) == len(mask)
     for key, value in values.items():
         if isinstance(value, dict):
             nested = {k: v for k, v in value.items() if not k.startswith("_")}
             info[key] = _vector_info(nested, mask)
+        elif all_arms:
+            info[key] = value.copy()
         else:
             rows = mask.reshape(-1, *(1,) * (value.ndim - 1))
             absent = np.array(None) if value.dtype == object else np.zeros((), value.dtype)

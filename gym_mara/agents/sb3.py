@@ -4,44 +4,54 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
+import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit
 from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from gym_mara.envs import MaraVectorEnv
+from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
+
+_KNOWN_WRAPPERS = (OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit, Monitor)
 
 
 class MaraVecEnv(VecEnv):
-    """N arms for Stable-Baselines3, their actions rescaled so that [-1, 1] spans each joint's range.
+    """N arms for Stable-Baselines3, by default with actions in [-1, 1] that span each joint's range.
 
     The info of an arm is empty but at the end of its episode, where it holds `terminal_observation`,
     `TimeLimit.truncated`, Monitor's `episode`, and what MaraEnv reports at a last step.
 
     Args:
         env: the environment, which must reset in the same step.
+        action_space: the space of the actions (J,), stretched over the environment's own, as `RescaleAction` does.
 
     Raises:
         GymMaraError: the environment's autoreset mode is another.
     """
 
-    def __init__(self, env: MaraVectorEnv) -> None:
+    def __init__(self, env: MaraVectorEnv, action_space: Box | None = None) -> None:
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise GymMaraError(
                 "Stable-Baselines3 wants episodes reset in the same step: autoreset_mode='SameStep'"
             )
         self.env = env
-        shape = (env.simulation.robot.num_joints,)
-        super().__init__(
-            env.num_envs, env.single_observation_space, Box(-1.0, 1.0, shape, np.float32)
-        )
+        own, simulation = env.single_action_space, env.simulation
+        low, high = simulation.target_low, simulation.target_high
+        if action_space is not None:
+            low, high = own.low.astype(np.float64), own.high.astype(np.float64)
+        space = Box(-1.0, 1.0, own.shape, np.float32) if action_space is None else action_space
+        super().__init__(env.num_envs, env.single_observation_space, space)
         self.metadata = env.metadata
-        self._low, self._high = env.simulation.target_low, env.simulation.target_high
-        self._actions: NDArray[np.float32] = np.zeros((env.num_envs, *shape), np.float32)
+        self._target_low, self._low = low, space.low.astype(np.float64)
+        self._span = (high - low) / (space.high.astype(np.float64) - self._low)
+        self._actions: NDArray[np.float32] = np.zeros((env.num_envs, *own.shape), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._start = time.time()
         self.reward_sum = 0.0
@@ -59,9 +69,8 @@ class MaraVecEnv(VecEnv):
         self._actions = actions
 
     def targets(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The joint targets (N, J), rad, that actions (N, J) in [-1, 1] stand for."""
-        span = 0.5 * (self._high - self._low)
-        return self._low + span * (np.asarray(actions, np.float64) + 1.0)
+        """The joint targets (N, J), rad, that actions (N, J) stand for."""
+        return self._target_low + self._span * (np.asarray(actions, np.float64) - self._low)
 
     def step_wait(
         self,
@@ -124,6 +133,52 @@ class MaraVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         return [False for _ in self._get_indices(indices)]
+
+
+def in_one_batch(arms: VecEnv) -> VecEnv:
+    """The arms of a DummyVecEnv, each an environment of its own, as one MaraVecEnv: alike, at a fraction of the time.
+
+    For what `make_vec_env` makes, and as the `vec_env_wrapper` of RL Baselines3 Zoo. What `RescaleAction` asks for holds
+    on, and a Monitor around the first arm, its file too, is one around the batch. Arms in processes or in a viewer stay as they are.
+
+    Raises:
+        GymMaraError: the arms differ, are not made by `gymnasium.make`, or have a wrapper that a batch does not know.
+    """
+    if not isinstance(arms, DummyVecEnv) or arms.render_mode == "human":
+        return arms
+    specs = [env.spec for env in arms.envs]
+    first, spec = arms.envs[0], specs[0]
+    if spec is None or type(first.unwrapped) is not MaraEnv or len(set(map(repr, specs))) > 1:
+        raise GymMaraError(
+            "only arms that are alike, MaraEnv by gymnasium.make, can be put into one batch; not "
+            + ", ".join(sorted({str(env) for env in arms.envs}))
+        )
+    monitor: Monitor | None = None
+    layer: Any = first
+    while isinstance(layer, gymnasium.Wrapper):
+        if not isinstance(layer, _KNOWN_WRAPPERS):
+            raise GymMaraError(
+                f"{type(layer).__name__} wraps a single arm, and cannot be put around a batch; "
+                f"of wrappers it knows {', '.join(sorted(w.__name__ for w in _KNOWN_WRAPPERS))}"
+            )
+        monitor = layer if isinstance(layer, Monitor) else monitor
+        layer = layer.env
+    batch: VecEnv = MaraVecEnv(
+        MaraVectorEnv(
+            arms.num_envs,
+            **spec.kwargs,
+            max_episode_steps=spec.max_episode_steps,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+        ),
+        cast(Box, arms.action_space),
+    )
+    batch._seeds = arms._seeds
+    arms.close()
+    if monitor is not None:
+        writer = monitor.results_writer
+        file = None if writer is None else writer.file_handler.name
+        batch = VecMonitor(batch, file, monitor.info_keywords)
+    return batch
 
 
 def _at(values: dict[str, Any], index: int) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from gym_mara import rotations
 Floats = NDArray[np.float64]
 
 # From this many configurations on NumPy is the faster.
-BATCH_FROM = 8
+BATCH_FROM = 24
 
 
 class Kinematics:

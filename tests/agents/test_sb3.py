@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import NormalizeObservation, RescaleAction
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.sb3 import MaraVecEnv
-from gym_mara.envs import MaraVectorEnv
+from gym_mara.agents.sb3 import MaraVecEnv, in_one_batch
+from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 
 
@@ -95,6 +101,86 @@ def test_any_algorithm_of_stable_baselines3_trains_on_it() -> None:
 def test_it_wants_episodes_reset_in_the_same_step() -> None:
     with pytest.raises(GymMaraError, match="SameStep"):
         MaraVecEnv(MaraVectorEnv(2))
+
+
+GENTLE = "gym_mara/MARACollision-v0"
+
+
+@pytest.mark.parametrize("env_id", ["gym_mara/MARA-v0", "gym_mara/MARARandomTarget-v0"])
+@pytest.mark.parametrize("options", [{}, {"on_collision": "terminate"}])
+def test_arms_in_one_batch_are_those_that_were_apart(env_id: str, options: dict[str, Any]) -> None:
+    def arms() -> VecEnv:
+        return make_vec_env(
+            env_id,
+            5,
+            seed=7,
+            env_kwargs={"max_episode_steps": 4, **options},
+            wrapper_class=rescaled,
+        )
+
+    apart, together = arms(), in_one_batch(arms())
+    assert isinstance(together.unwrapped, MaraVecEnv)
+    assert together.action_space == apart.action_space
+    np.testing.assert_array_equal(together.reset(), apart.reset())
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(13):
+        action = rng.uniform(-0.5, 1.5, (5, 6)).astype(np.float32)
+        mine, theirs = together.step(action), apart.step(action)
+        for one, other in zip(mine[:3], theirs[:3], strict=True):
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-6)
+        for info, expected in zip(mine[3], theirs[3], strict=True):
+            if "terminal_observation" in expected:
+                ends += 1
+                for key in ("terminal_observation", "position_error", "TimeLimit.truncated"):
+                    np.testing.assert_allclose(info[key], expected[key], rtol=0.0, atol=1e-6)
+                for key in ("r", "l"):
+                    assert info["episode"][key] == pytest.approx(expected["episode"][key], abs=1e-5)
+    assert ends >= 15
+
+
+def rescaled(env: Any) -> RescaleAction[Any, Any, Any]:
+    """Actions in a range of one's own."""
+    return RescaleAction(env, np.float32(-0.5), np.float32(1.5))
+
+
+def test_the_batch_writes_the_monitor_s_file(tmp_path: Path) -> None:
+    arms = make_vec_env(
+        "gym_mara/MARA-v0", 2, monitor_dir=str(tmp_path), env_kwargs={"max_episode_steps": 4}
+    )
+    batch = in_one_batch(arms)
+    batch.reset()
+    for _ in range(9):
+        batch.step(np.zeros((2, 6), np.float32))
+    batch.close()
+    assert load_results(str(tmp_path))["l"].tolist() == [4] * 4
+
+
+def test_arms_in_processes_or_in_a_viewer_stay_as_they_are() -> None:
+    watched = make_vec_env("gym_mara/MARA-v0", 1, env_kwargs={"render_mode": "human"})
+    assert in_one_batch(watched) is watched
+    batch = small()
+    assert in_one_batch(batch) is batch
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            [lambda: gymnasium.make("gym_mara/MARA-v0"), lambda: gymnasium.make(GENTLE)],
+            r"only arms that are alike, MaraEnv by gymnasium.make.*not <.*MARA-v0.*MARACollision-v0",
+        ),
+        ([lambda: gymnasium.make("Pendulum-v1")], "only arms that are alike.*PendulumEnv"),
+        ([lambda: gymnasium.make("gym_mara/MARAGoal-v0")], "only arms that are alike"),
+        ([MaraEnv], "only arms that are alike"),
+        (
+            [lambda: NormalizeObservation(gymnasium.make("gym_mara/MARA-v0"))],
+            "NormalizeObservation wraps a single arm.*it knows Monitor, OrderEnforcing, Pass",
+        ),
+    ],
+)
+def test_arms_that_do_not_go_into_one_batch(make: list[Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        in_one_batch(DummyVecEnv(make))
 
 
 def test_attributes_and_methods_reach_the_environment() -> None:
