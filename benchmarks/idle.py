@@ -52,7 +52,8 @@ class IdleVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.single_observation_space, self.single_action_space = _SPACES
         self.observation_space = batch_space(_SPACES[0], num_envs)
         self.action_space = batch_space(_SPACES[1], num_envs)
-        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode)}
+        self.autoreset_mode = AutoresetMode(autoreset_mode)  # where TorchRL looks for it
+        self.metadata = {"autoreset_mode": self.autoreset_mode}
         self._observation = np.zeros(self.observation_space.shape or ())
         self._steps = np.zeros(num_envs, np.int64)
 

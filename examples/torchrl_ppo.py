@@ -24,8 +24,8 @@ with needs("this example", "torchrl"):
     from torchrl.objectives import ClipPPOLoss
     from torchrl.objectives.value import GAE
 
-ARMS = 64
-ROLLOUT = 16
+# As TorchRL's own PPO for MuJoCo 2048 frames and ten epochs, the frames spread over many arms and in larger batches.
+ARMS, ROLLOUT, EPOCHS, BATCH = 64, 32, 10, 256
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> EnvBase:
@@ -34,22 +34,24 @@ def make(env_id: str = "gym_mara/MARA-v0") -> EnvBase:
     return TransformedEnv(GymWrapper(arms), DoubleToFloat(in_keys=["observation"]))
 
 
+def _network(inputs: int, outputs: int) -> nn.Sequential:
+    hidden = nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh()
+    return nn.Sequential(*hidden, nn.Linear(64, outputs))
+
+
 def train(env: EnvBase, steps: int) -> float:
     """Train for so many steps over all arms, and return what a step of the last rollout earned."""
     torch.manual_seed(0)
     inputs = env.observation_spec["observation"].shape[-1]
     outputs = env.action_spec.shape[-1]
-    network = nn.Sequential(
-        nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 2 * outputs), NormalParamExtractor()
-    )
+    network = nn.Sequential(_network(inputs, 2 * outputs), NormalParamExtractor())
     actor = ProbabilisticActor(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
     )
-    values = nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 1))
-    critic = ValueOperator(values, in_keys=["observation"])
+    critic = ValueOperator(_network(inputs, 1), in_keys=["observation"])
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
     loss = ClipPPOLoss(actor, critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
@@ -61,13 +63,15 @@ def train(env: EnvBase, steps: int) -> float:
             )
             now = env.step_mdp(rollout[:, -1])
             advantage(rollout)
-        for _ in range(4):
-            terms = loss(rollout.reshape(-1))
-            total = sum(terms[name] for name in terms.keys() if name.startswith("loss_"))  # noqa: SIM118
-            optimizer.zero_grad()
-            total.backward()
-            nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
-            optimizer.step()
+        samples = rollout.reshape(-1)
+        for _ in range(EPOCHS):
+            for chosen in torch.randperm(len(samples)).split(BATCH):
+                terms = loss(samples[chosen])
+                total = sum(terms[name] for name in terms.keys() if name.startswith("loss_"))  # noqa: SIM118
+                optimizer.zero_grad()
+                total.backward()
+                nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                optimizer.step()
     return float(rollout["next", "reward"].mean())
 
 
