@@ -60,8 +60,8 @@ WAYS: dict[str, Callable[..., Any]] = {
 def train(env: Any, steps: int) -> PPO:
     """Train for so many steps over all arms: with the library's own settings, but for hundreds of arms larger batches."""
     arms = getattr(env, "num_envs", 1)
-    settings = {"batch_size": 256} if arms > 8 else {}
-    model = PPO("MlpPolicy", env, n_steps=2048 // arms, device="cpu", seed=0, **settings)
+    rollout, batch = 2048 // arms, 256 if arms > 8 else 64
+    model = PPO("MlpPolicy", env, n_steps=rollout, batch_size=batch, device="cpu", seed=0)
     return model.learn(steps)
 
 

@@ -65,7 +65,7 @@ def train(env: EnvBase, steps: int) -> float:
             advantage(rollout)
         samples = rollout.reshape(-1)
         for _ in range(EPOCHS):
-            for chosen in torch.randperm(len(samples)).split(BATCH):
+            for chosen in torch.randperm(len(samples)).reshape(-1, BATCH):
                 terms = loss(samples[chosen])
                 total = sum(terms[name] for name in terms.keys() if name.startswith("loss_"))  # noqa: SIM118
                 optimizer.zero_grad()

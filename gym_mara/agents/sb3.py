@@ -42,11 +42,13 @@ class MaraVecEnv(VecEnv):
                 "Stable-Baselines3 wants episodes reset in the same step: autoreset_mode='SameStep'"
             )
         self.env = env
-        own, simulation = env.single_action_space, env.simulation
-        low, high = simulation.target_low, simulation.target_high
-        if action_space is not None:
+        own = env.simulation.action_space
+        if action_space is None:
+            space = Box(-1.0, 1.0, own.shape, np.float32)
+            low, high = env.simulation.target_low, env.simulation.target_high
+        else:
+            space = action_space
             low, high = own.low.astype(np.float64), own.high.astype(np.float64)
-        space = Box(-1.0, 1.0, own.shape, np.float32) if action_space is None else action_space
         super().__init__(env.num_envs, env.single_observation_space, space)
         self.metadata = env.metadata
         self._target_low, self._low = low, space.low.astype(np.float64)
