@@ -45,7 +45,7 @@ def through_batch(script: str, steps: int, way: str = "make") -> Callable[[str],
     """Trains as an example does whose arms are a VecEnv of ours."""
 
     def of(env_id: str) -> Job:
-        from idle import IdleVecEnv
+        from idle_vec_env import IdleVecEnv
 
         module = importlib.import_module(script)
         arms = getattr(module, way)()
@@ -105,7 +105,7 @@ LIBRARIES: dict[str, tuple[str, Callable[[str], Job]]] = {
     "Tianshou": ("tianshou", through_example("tianshou_ppo", 65536)),
     "sbx": ("sbx-rl", through_batch("sbx_ppo", 65536)),
 }
-RLLIB = {"RLlib": ("ray", through_rllib(40_000))}
+RLLIB = {"RLlib": ("ray", through_rllib(100_000))}
 
 
 def seconds(job: Job) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-from idle import IdleVecEnv
+from idle_vec_env import IdleVecEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from gym_mara.agents import presets

@@ -43,11 +43,10 @@ class MaraVecEnv(VecEnv):
             )
         self.env = env
         own = env.simulation.action_space
+        space: Box = action_space or Box(-1.0, 1.0, own.shape, np.float32)
         if action_space is None:
-            space = Box(-1.0, 1.0, own.shape, np.float32)
             low, high = env.simulation.target_low, env.simulation.target_high
         else:
-            space = action_space
             low, high = own.low.astype(np.float64), own.high.astype(np.float64)
         super().__init__(env.num_envs, env.single_observation_space, space)
         self.metadata = env.metadata
