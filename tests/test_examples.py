@@ -39,7 +39,7 @@ def test_no_example_is_forgotten() -> None:
 @pytest.mark.parametrize("call", CALLS)
 def test_an_example_runs(call: str, tmp_path: Path) -> None:
     script, *arguments = call.split()
-    printed = _run(str(EXAMPLES / script), *arguments, "--steps", "600", cwd=tmp_path)
+    printed = _run(str(EXAMPLES / script), *arguments, "--steps", "300", cwd=tmp_path)
     assert CALLS[call] in printed
 
 

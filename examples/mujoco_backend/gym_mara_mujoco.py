@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from gym_mara.backends import Backend
-from gym_mara.backends.servo import servo_motion
+from gym_mara.backends.servo import servo_motion, step_times
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision import make_checker
@@ -74,17 +74,12 @@ class MujocoBackend(Backend):
             "servo_gain": servo_gain,
         }
         self.physics_step = positive_number("physics_step", physics_step, "s")
-        steps = round(self.control_period / self.physics_step)
-        if abs(steps * self.physics_step - self.control_period) > 1e-9:
-            raise GymMaraError(
-                f"physics_step {physics_step} s must divide the control period, {control_period} s"
-            )
+        self._times = step_times(self.control_period, self.physics_step)[:, None, None]
         if max_joint_velocity is not None:
             limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.joint_velocity = np.minimum(limit, robot.velocity_limit)
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         self._gain = np.full(robot.num_joints, self.servo_gain)
-        self._times = self.physics_step * np.arange(steps + 1)[:, None, None]
         self._kinematics = robot.kinematics()
         self._checker = make_checker("coal", robot)
         self._model = build_model(robot, self.physics_step)

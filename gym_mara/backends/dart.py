@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gym_mara.backends.base import Backend
 from gym_mara.backends.dart_arm import Contact, DartArm, is_lost
 from gym_mara.backends.randomisation import Randomisation
-from gym_mara.backends.servo import servo_motion
+from gym_mara.backends.servo import servo_motion, step_times
 from gym_mara.errors import GymMaraError, positive_number, unknown
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
@@ -73,13 +73,7 @@ class DartBackend(Backend):
             "on_divergence": on_divergence,
         }
         self.physics_step = positive_number("physics_step", physics_step, "s")
-        steps = round(self.control_period / self.physics_step)
-        if steps < 1 or abs(steps * self.physics_step - self.control_period) > 1e-9:
-            raise GymMaraError(
-                f"physics_step {physics_step} s must divide the control period, {control_period} s, "
-                f"as {control_period / max(steps, 1):g} s does"
-            )
-        self._times = self.physics_step * np.arange(steps + 1)[:, None, None]
+        self._times = step_times(self.control_period, self.physics_step)[:, None, None]
         if max_joint_velocity is not None:
             limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.joint_velocity = np.minimum(limit, robot.velocity_limit)

@@ -7,7 +7,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.errors import GymMaraError
+
 Floats = NDArray[np.float64]
+
+
+def step_times(control_period: float, physics_step: float) -> Floats:
+    """The moments (S + 1,), s, between which the S physics steps of a control period lie, the first 0.
+
+    Raises:
+        GymMaraError: a control period is no whole number of physics steps.
+    """
+    steps = round(control_period / physics_step)
+    if steps < 1 or abs(steps * physics_step - control_period) > 1e-9:
+        raise GymMaraError(
+            f"physics_step {physics_step} s must divide the control period, {control_period} s, "
+            f"as {control_period / max(steps, 1):g} s does"
+        )
+    return physics_step * np.arange(steps + 1, dtype=np.float64)
 
 
 def servo_motion(
