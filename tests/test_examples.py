@@ -43,6 +43,19 @@ def test_an_example_runs(call: str, tmp_path: Path) -> None:
     assert CALLS[call] in printed
 
 
+def test_a_library_that_is_too_old_is_named_with_the_version_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stale = tmp_path / "skrl-1.0.0.dist-info"
+    stale.mkdir()
+    (stale / "METADATA").write_text("Metadata-Version: 2.1\nName: skrl\nVersion: 1.0.0\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    done = _done(str(EXAMPLES / "skrl_ppo.py"), cwd=tmp_path)
+    assert done.returncode != 0
+    assert "skrl>=2.0" in done.stderr
+    assert "1.0.0 is installed" in done.stderr
+
+
 @pytest.mark.parametrize("algo", ["ppo", "trpo", "acktr"])
 def test_the_zoo_trains_and_plays(algo: str, tmp_path: Path) -> None:
     folder = EXAMPLES / "rl_zoo3"
@@ -74,9 +87,9 @@ def test_a_backend_from_another_package_passes_the_contract(
     )
 
 
-def _run(*arguments: str, cwd: Path) -> str:
-    """What Python prints with these arguments; it must end well."""
-    done = subprocess.run(
+def _done(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Python, called with these arguments, once it has ended."""
+    return subprocess.run(
         [sys.executable, *arguments],
         check=False,
         capture_output=True,
@@ -84,5 +97,10 @@ def _run(*arguments: str, cwd: Path) -> str:
         cwd=cwd,
         timeout=300,
     )
+
+
+def _run(*arguments: str, cwd: Path) -> str:
+    """What Python prints with these arguments; it must end well."""
+    done = _done(*arguments, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
