@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from gym_mara.agents.parallel import ONE_THREAD
 from gym_mara.robot import RobotModel
 from tests.helpers import robot_model, write
+
+# Tests run in several processes, which share the cores, and so do the processes that they begin.
+os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
 settings.register_profile("gym_mara", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("gym_mara")
