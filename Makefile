@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
-# Nothing is compiled beforehand: of all that is installed little is ever imported.
+# What is imported is compiled then, and kept; most of what is installed never is.
+unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: demo test lint bench experiment test-oldest test-rllib test-wheel clean
