@@ -64,9 +64,13 @@ def single(env_id: str, **options: Any) -> Callable[[], int]:
     return run
 
 
-def batch(env_id: str, num_envs: int, **options: Any) -> Callable[[], int]:
-    """Steps of the native vector environment with random actions."""
-    envs = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
+def batch(
+    env_id: str, num_envs: int, by_samples: bool = False, **options: Any
+) -> Callable[[], int]:
+    """Steps of the native vector environment with random actions; with paths checked by their samples alone."""
+    envs: Any = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
+    if by_samples:
+        envs.unwrapped.simulation.backend._with_room = None
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(10)]
@@ -154,6 +158,23 @@ def print_throughput() -> None:
         )
 
 
+def print_travelling() -> None:
+    """Arms that travel beside arms that teleport, and what looking for room around a path is worth."""
+    travelling: dict[str, Any] = {"max_joint_velocity": 1.57}
+    measured = rates(
+        {
+            "teleporting": batch("gym_mara/MARA-v0", 64),
+            "travelling at 1.57 rad/s": batch("gym_mara/MARA-v0", 64, **travelling),
+            "the same, by samples alone": batch("gym_mara/MARA-v0", 64, True, **travelling),
+        }
+    )
+    print("\n## 64 arms that travel\n")
+    row("joints", "steps per second", "of teleporting")
+    row("---", "---", "---")
+    for name, rate in measured.items():
+        row(name, f"{rate:,.0f}", f"{rate / measured['teleporting']:.2f}")
+
+
 def print_peers() -> None:
     """One environment through gymnasium.make, beside the peers that are installed."""
     functions = {}
@@ -185,6 +206,7 @@ def main() -> None:
         f"{len(os.sched_getaffinity(0))} cores"
     )
     print_throughput()
+    print_travelling()
     print_peers()
     if not arguments.no_training:
         print_training()
