@@ -233,6 +233,12 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         Raises:
             GymMaraError: the actions have the wrong shape or are not finite; no arm has moved then.
         """
+        return self.advance(actions, with_info=True)
+
+    def advance(
+        self, actions: ArrayLike, with_info: bool
+    ) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
+        """`step`, by choice without an `info` but where an episode ends or begins: that spares a learner its making."""
         resetting = self._ended
         some_reset = bool(np.count_nonzero(resetting))
         if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
@@ -249,10 +255,13 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             reward[resetting] = 0.0
             terminated, truncated = terminated & ~resetting, truncated & ~resetting
         ended = terminated | truncated
-        info = _vector_info(outcome.info, ~resetting)
+        some_ended = bool(np.count_nonzero(ended))
+        info: dict[str, Any] = {}
+        if with_info or some_ended or some_reset:
+            info = _vector_info(outcome.info, ~resetting)
         if some_reset:
             self._report_beginning(info, resetting)
-        if np.count_nonzero(ended):
+        if some_ended:
             info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = np.full(self.num_envs, None, dtype=object)

@@ -76,14 +76,14 @@ class MaraVecEnv(VecEnv):
     def step_wait(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        observation, reward, terminated, truncated, info = self.env.step(
-            self.targets(self._actions)
+        observation, reward, terminated, truncated, info = self.env.advance(
+            self.targets(self._actions), with_info=False
         )
         self._returns += reward
         self.reward_sum += float(reward.sum())
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for index in np.flatnonzero(done).tolist():
+        for index in np.flatnonzero(done).tolist() if np.count_nonzero(done) else ():
             infos[index] = self._final_info(index, info)
             infos[index]["TimeLimit.truncated"] = bool(truncated[index] and not terminated[index])
             self._returns[index] = 0.0
