@@ -6,6 +6,8 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -219,12 +221,14 @@ class Viewer:
             self.show(simulation)
         if now - self._plotted >= _PLOT_PERIOD or not self._playing:
             self._plotted = now
-            self._plot(simulation)
+            with _whatever_its_sender_does():
+                self._plot(simulation)
 
     def show(self, simulation: Simulation) -> None:
         """Show the arm as it is."""
         self._drawn = time.monotonic()
-        self._stage.show(simulation.view(0))
+        with _whatever_its_sender_does():
+            self._stage.show(simulation.view(0))
 
     def _plot(self, simulation: Simulation) -> None:
         rows = list(self._history)
@@ -247,6 +251,19 @@ class Viewer:
         if clients:
             time.sleep(_FAREWELL)
         self._server.stop()
+
+
+@contextmanager
+def _whatever_its_sender_does() -> Iterator[None]:
+    """Go on where viser could not wake its sender: it does so from our thread, by an asyncio event that may be changing.
+
+    What was to be shown is queued by then, and what comes next wakes it.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "deque mutated" not in str(error):
+            raise
 
 
 def _serve(settings: RenderSettings, robot: str) -> viser.ViserServer:

@@ -236,3 +236,23 @@ def test_what_collides_is_shown() -> None:
     assert loop.env.simulation.view(0).touching
     assert loop.env.render() is None
     loop.env.close()
+
+
+@pytest.mark.parametrize("what", ["_plot", "_stage.show"])
+def test_a_sender_that_could_not_be_woken_does_not_stop_the_arm(
+    monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def fails(*_: Any) -> None:
+        raise RuntimeError(reason)
+
+    loop = Loop()
+    owner = loop.viewer._stage if "." in what else loop.viewer
+    monkeypatch.setattr(owner, what.split(".")[-1], fails)
+    loop.viewer._drawn = loop.viewer._plotted = 0.0  # both are due
+    reason = "deque mutated during iteration"
+    loop.env.step(ACTION)
+    loop.viewer._drawn = loop.viewer._plotted = 0.0
+    reason = "anything else"
+    with pytest.raises(RuntimeError, match="anything else"):
+        loop.env.step(ACTION)
+    loop.env.close()
