@@ -109,7 +109,7 @@ def test_a_slider_that_is_moved_leads_the_joint_until_it_is_let_go(page: Page, l
     page.get_by_role("slider").nth(2).focus()  # the first is the speed's
     page.keyboard.press("End")
     until(lambda: loop.q[1] > 1.5, "motor2 goes to its upper limit")
-    assert page.get_by_label("By hand").is_checked()
+    until(page.get_by_label("By hand").is_checked, "the page shows that a hand leads")
     page.get_by_label("By hand").uncheck()
     until(lambda: abs(loop.q[1]) < 1e-3, "the action leads again")
 
