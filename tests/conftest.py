@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -15,8 +21,44 @@ from tests.helpers import robot_model, write
 # Tests run in several processes, which share the cores, and so do the processes that they begin.
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
+# A shell that runs `make test &` ignores SIGINT, and so would every process that the tests start.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Helpers of multiprocessing that live as long as the process that uses them.
+_LASTING = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+_GRACE = 10.0
+"""How long a process may take to end after its test, s."""
+
 settings.register_profile("gym_mara", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("gym_mara")
+
+
+@pytest.fixture(autouse=True)
+def _no_process_is_left_behind() -> Iterator[None]:
+    """Kill the processes that a test has started and not ended, and fail the test."""
+    before = set(_children())
+    yield
+    deadline = time.monotonic() + _GRACE
+    while (left := set(_children()) - before) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    commands = []
+    for process in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            commands.append(" ".join(process.cmdline()))
+            process.kill()
+    assert not commands, f"the test left processes behind: {commands}"
+
+
+def _children() -> list[psutil.Process]:
+    """The living descendants of this process, without those that multiprocessing keeps."""
+    children = []
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            command = " ".join(process.cmdline())
+            if command and not any(name in command for name in _LASTING):
+                children.append(process)
+    return children
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import csv
 import functools
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +102,20 @@ def write(path: Path, text: str) -> Path:
     """Write a file and return its path."""
     path.write_text(text)
     return path
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Python with these arguments, in a process group of its own that is killed at the end, whatever happens."""
+    process = subprocess.Popen(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()

@@ -8,8 +8,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import replace
@@ -30,6 +28,7 @@ from gym_mara.agents.parallel import Engine, Say, run_tasks
 from gym_mara.agents.presets import PRESETS
 from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
+from tests.helpers import started
 
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
 
@@ -71,16 +70,14 @@ def test_what_has_finished_is_not_trained_again(finished_grid: Path) -> None:
 def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_path: Path) -> None:
     folder = tmp_path / "grid"
     options = ["--envs", "MARA-v0", "--algos", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
-    command = [sys.executable, "-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
+    command = ["-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
     command += ["--checkpoint-every", "2048", "--out", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + 120
-    while not list(folder.glob("*/checkpoints/2*")):
-        assert process.poll() is None, "the grid ended early"
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    with started(*command) as process:
+        deadline = time.monotonic() + 120
+        while not list(folder.glob("*/checkpoints/2*")):
+            assert process.poll() is None, "the grid ended early"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
     assert run_grid(folder, GRID, processes(2), deaf) == {}
     for name in GRID.runs():
         mine, theirs = read_result(folder / name), read_result(finished_grid / name)

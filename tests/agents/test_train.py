@@ -6,9 +6,6 @@ import base64
 import json
 import pickle
 import shutil
-import signal
-import subprocess
-import sys
 import time
 import zipfile
 from dataclasses import replace
@@ -31,6 +28,7 @@ from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.train import resume, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import ROLLOUT, config, silent
+from tests.helpers import started
 
 
 def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
@@ -97,17 +95,13 @@ def test_a_cut_off_run_goes_on_as_if_it_had_not_been(
 
 def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
-    process = subprocess.Popen(
-        [*command, "--checkpoint-every", str(ROLLOUT)], stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 120
-    while not (run / "checkpoints" / str(2 * ROLLOUT)).is_dir():
-        assert process.poll() is None, "the training ended early"
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    command = ["-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
+    with started(*command, "--checkpoint-every", str(ROLLOUT)) as process:
+        deadline = time.monotonic() + 120
+        while not (run / "checkpoints" / str(2 * ROLLOUT)).is_dir():
+            assert process.poll() is None, "the training ended early"
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
     reached = int(RunFolder.open(run).checkpoints()[-1].name)
     text = (run / "config.json").read_text()
     (run / "config.json").write_text(text.replace("10000000", str(reached + ROLLOUT)))

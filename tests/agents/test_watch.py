@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import time
 import urllib.request
@@ -20,6 +19,7 @@ from gym_mara.agents.watch import film_run
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film
 from tests.browser import chromium
+from tests.helpers import started
 
 # Readers of films leave pipes open.
 pytestmark = pytest.mark.filterwarnings(
@@ -192,10 +192,9 @@ def test_watch_serves_the_viewer_until_it_is_interrupted(
 ) -> None:
     what = [str(finished_run.path)] if with_run else ["--env", "MARAOrient-v0"]
     port = 8300 + with_run
-    command = [sys.executable, "-m", "gym_mara.cli", "watch", *what]
+    command = ["-m", "gym_mara.cli", "watch", *what]
     command += ["--backend", "dart", "--set", f"viewer_port={port}"]
-    watching = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
+    with started(*command) as watching:
         deadline = time.monotonic() + 60
         while True:
             try:
@@ -208,7 +207,6 @@ def test_watch_serves_the_viewer_until_it_is_interrupted(
                 time.sleep(0.2)
         time.sleep(1.0)
         assert watching.poll() is None, "it goes on"
-    finally:
         watching.send_signal(signal.SIGINT)
         out, _ = watching.communicate(timeout=30)
     assert watching.returncode == 130
