@@ -23,9 +23,8 @@ def needs(part: str, extra: str, *libraries: str) -> Iterator[None]:
     Raises:
         MissingExtraError: a library is absent, too old, or cannot be imported.
     """
-    for wanted in _requirements(extra):
-        if libraries and wanted.name not in libraries:
-            continue
+    wanted_ones = [r for r in _requirements(extra) if not libraries or r.name in libraries]
+    for wanted in wanted_ones:
         named = f"{wanted.name}{wanted.specifier}"
         try:
             found = version(wanted.name)
@@ -42,9 +41,9 @@ def needs(part: str, extra: str, *libraries: str) -> Iterator[None]:
             raise
         raise MissingExtraError(part, error.name or str(error), extra) from error
     except ImportError as error:
-        why = f"which cannot be imported ({error})"
+        names = " and ".join(libraries or [r.name for r in wanted_ones]) or error.name or extra
         raise MissingExtraError(
-            part, " and ".join(libraries) or str(error.name), extra, why
+            part, names, extra, f"which cannot be imported ({error})"
         ) from error
 
 

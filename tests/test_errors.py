@@ -76,6 +76,16 @@ def test_a_library_that_does_not_load_is_told_with_the_reason() -> None:
         raise ImportError("no libGL", name="dartpy")
 
 
+def test_a_library_without_a_name_in_its_error_is_named_by_its_extra() -> None:
+    with (
+        pytest.raises(
+            MissingExtraError, match=r"needs dartpy, which cannot be imported \(no libGL"
+        ),
+        extras.needs("the backend 'dart'", "dart"),
+    ):
+        raise ImportError("no libGL")
+
+
 def test_a_mistake_of_ours_is_no_missing_library() -> None:
     with pytest.raises(ModuleNotFoundError) as told, extras.needs("training", "train"):
         import gym_mara.nowhere  # type: ignore[import-not-found] # noqa: F401
