@@ -8,9 +8,9 @@ from dataclasses import replace
 from idle_vec_env import IdleVecEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from gym_mara.agents import presets
-from gym_mara.agents.evaluate import make_env
-from gym_mara.agents.train import new_agent
+from gym_mara.agents.algorithms import presets
+from gym_mara.agents.runs.evaluation import make_env
+from gym_mara.agents.training.train import new_agent
 
 STEPS = 1_000_000
 SLICES = 5

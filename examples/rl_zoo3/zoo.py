@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 
 import gym_mara  # noqa: F401 - registers the environments, as --gym-packages does
-from gym_mara.agents.acktr import ACKTR
+from gym_mara.agents.algorithms.acktr import ACKTR
 from gym_mara.extras import needs
 
 with needs("this example", "zoo"):

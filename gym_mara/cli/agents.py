@@ -28,7 +28,7 @@ from gym_mara.cli.common import (
 from gym_mara.errors import GymMaraError
 
 if TYPE_CHECKING:
-    from gym_mara.agents.run import RunFolder
+    from gym_mara.agents.runs.folder import RunFolder
 
 _UNITS = {
     "position_error_mm": "position error, mm",
@@ -66,9 +66,9 @@ def train(
 ) -> None:
     """Train an agent and leave a run folder: policy, checkpoints, learning curve, TensorBoard log."""
     with needs_agents():
-        from gym_mara.agents.run import RunConfig, RunFolder
-        from gym_mara.agents.train import resume as go_on
-        from gym_mara.agents.train import train as begin
+        from gym_mara.agents.runs.folder import RunConfig, RunFolder
+        from gym_mara.agents.training.train import resume as go_on
+        from gym_mara.agents.training.train import train as begin
 
     if resume is not None:
         _refuse_beside_resume(context)
@@ -125,8 +125,8 @@ def evaluate(
 ) -> None:
     """Play a run's deterministic policy: position error and angle at the last step, reward, collisions."""
     with needs_agents():
-        from gym_mara.agents.evaluate import evaluate_run, spread
-        from gym_mara.agents.run import RunFolder
+        from gym_mara.agents.runs.evaluation import evaluate_run, spread
+        from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     if as_json:
@@ -144,8 +144,8 @@ def transfer(
 ) -> None:
     """Play a run's policy on every backend, side by side: what it loses between simulations."""
     with needs_agents():
-        from gym_mara.agents.run import RunFolder
-        from gym_mara.agents.transfer import transfer as play
+        from gym_mara.agents.inspection.transfer import transfer as play
+        from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     rows = play(folder, episodes=episodes, which=policy, options=keyword_arguments(settings))
@@ -199,7 +199,7 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
 
 
 def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
-    from gym_mara.agents.evaluate import evaluate_run, spread
+    from gym_mara.agents.runs.evaluation import evaluate_run, spread
 
     metrics = evaluate_run(run, **arguments)
     config = run.config

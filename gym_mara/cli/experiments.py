@@ -26,8 +26,8 @@ from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
-    from gym_mara.agents.benchmark import Grid
-    from gym_mara.agents.parallel import Engine
+    from gym_mara.agents.experiments.grid import Grid
+    from gym_mara.agents.experiments.local import Engine
 
 ENGINES = ("local", "ray")
 
@@ -69,8 +69,8 @@ def benchmark(
 ) -> None:
     """Train every algorithm on every environment with every seed; may be killed and started again."""
     with needs_agents():
-        from gym_mara.agents.benchmark import Grid, open_grid, run_grid
-        from gym_mara.agents.figures import plot_grid
+        from gym_mara.agents.experiments.figures import plot_grid
+        from gym_mara.agents.experiments.grid import Grid, open_grid, run_grid
 
     grid = Grid(
         envs=tuple(task_name(env.strip()) for env in envs.split(",")),
@@ -106,7 +106,7 @@ def benchmark(
 def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:
     """Draw a benchmark's figures and write its tables."""
     with needs_agents():
-        from gym_mara.agents.figures import plot_grid
+        from gym_mara.agents.experiments.figures import plot_grid
 
     for file in plot_grid(folder):
         out.print(str(file), soft_wrap=True)
@@ -129,7 +129,7 @@ def search(
 ) -> None:
     """Search an algorithm's hyperparameters with Optuna, on seeds that no result is reported of."""
     with needs_agents():
-        from gym_mara.agents import search as of
+        from gym_mara.agents.experiments import search as of
 
     workers = _jobs(jobs)
     wanted = of.Search(
@@ -165,12 +165,12 @@ def _engine(name: str, jobs: int | None, address: str | None) -> Engine:
     if name == "local":
         if address is not None:
             raise GymMaraError("--address is that of a Ray cluster: give --engine ray too")
-        from gym_mara.agents.parallel import run_tasks
+        from gym_mara.agents.experiments.local import run_tasks
 
         return partial(run_tasks, jobs=_jobs(jobs))
     if jobs is not None:
         raise GymMaraError("--jobs counts processes of this machine; a cluster uses all its cores")
-    from gym_mara.agents.cluster import run_on_ray
+    from gym_mara.agents.experiments.ray import run_on_ray
 
     return partial(run_on_ray, address=address)
 
@@ -183,7 +183,7 @@ class _GridView:
     """The state of a grid's runs, as a table."""
 
     def __init__(self, folder: Path, grid: Grid) -> None:
-        from gym_mara.agents.benchmark import read_result
+        from gym_mara.agents.experiments.grid import read_result
 
         self._grid = grid
         self._began = time.monotonic()

@@ -57,8 +57,8 @@ def watch(
             _by_hand(task_name(env), backend or "pinocchio", speed, options)
         return
     with needs_agents():
-        from gym_mara.agents.run import RunFolder
-        from gym_mara.agents.watch import film_run, watch_run
+        from gym_mara.agents.inspection.watch import film_run, watch_run
+        from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     backends = (backend or folder.config.backend).split(",")
@@ -99,8 +99,8 @@ def report(
 ) -> None:
     """Write a page about a run: curves, an episode on every backend, the tool's path, a video, the configuration."""
     with needs_agents():
-        from gym_mara.agents.report import write_report
-        from gym_mara.agents.run import RunFolder
+        from gym_mara.agents.inspection.report import write_report
+        from gym_mara.agents.runs.folder import RunFolder
 
     with interruptible("Interrupted; no report was written."):
         out.print(str(write_report(RunFolder.open(run), out_file, which=policy)), soft_wrap=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gym_mara.agents.run import RunConfig, RunFolder
-from gym_mara.agents.train import train, use_one_thread
+from gym_mara.agents.runs.folder import RunConfig, RunFolder
+from gym_mara.agents.training.train import train, use_one_thread
 
 ROLLOUT = 256 * 2
 """Steps between two updates of the preset."""

@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.sb3 import MaraVecEnv, in_one_batch
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecVideoRecorder
 
-from gym_mara.agents.evaluate import make_env
+from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError, MissingExtraError

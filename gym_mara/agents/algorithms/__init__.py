@@ -1,0 +1,1 @@
+"""The algorithms: what each is called, its class, its presets and its search space; and those that are ours."""

@@ -1,0 +1,1 @@
+"""What a policy does: recorded, watched, filmed, compared across backends, reported."""

@@ -1,0 +1,1 @@
+"""A run on disk: its folder, its policy, and how good it is."""

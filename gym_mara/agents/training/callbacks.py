@@ -1,0 +1,140 @@
+"""What happens around the updates of a training: checkpoints, evaluation, a bar of progress."""
+
+from __future__ import annotations
+
+import pickle
+import random
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from gym_mara.agents.runs.evaluation import make_env, play
+from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.runs.policy import normalisation, save_policy
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.training.learning_curve import plot_learning_curve
+
+Report = Callable[[int, dict[str, float]], None]
+
+
+class Keeper(BaseCallback):
+    """Writes checkpoints, evaluates the deterministic policy, keeps the best, and logs the training reward.
+
+    All of it happens between two updates, where environment, policy and random generators are at rest together: a run
+    that goes on from a checkpoint goes on exactly as it would have.
+
+    Args:
+        run: where to write.
+        best: the best evaluation so far, as reward per step.
+        elapsed: how long the run has trained before, s.
+        report: called after every update with the number of steps and what to show.
+    """
+
+    def __init__(self, run: RunFolder, best: float, elapsed: float, report: Report) -> None:
+        super().__init__()
+        self.run = run
+        self.best = best
+        self._began = time.monotonic() - elapsed
+        self.report = report
+        self.shown: dict[str, float] = {}
+        self._next = 0
+        self._eval_env: MaraVecEnv | None = None
+
+    def _on_training_start(self) -> None:
+        self._next = self.num_timesteps + self.run.config.checkpoint_every
+        config = self.run.config
+        self._eval_env = make_env(config.env, config.backend, 1, config.env_options)
+
+    def _on_rollout_start(self) -> None:
+        # The model's own count: the callback's is set later in the rollout.
+        if self.model.num_timesteps >= self._next:
+            self._next = self.model.num_timesteps + self.run.config.checkpoint_every
+            self.checkpoint()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model = self.model
+        env = base_env(model)
+        steps = self.model.n_steps * env.num_envs  # type: ignore[attr-defined]
+        self.shown["reward_per_step"] = env.reward_sum / steps
+        env.reward_sum = 0.0
+        self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
+        self.report(self.model.num_timesteps, self.shown)
+
+    def _on_training_end(self) -> None:
+        self.checkpoint()
+        plot_learning_curve(self.run)
+        # What makes the run a finished one comes last.
+        save_policy(self.run.path / "last", self.model)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Free the environment of the evaluations."""
+        if self._eval_env is not None:
+            self._eval_env.close()
+
+    def checkpoint(self) -> None:
+        """Evaluate, keep the policy if it is the best so far, and write a checkpoint."""
+        model: Any = self.model
+        steps = model.num_timesteps
+        for name, value in self._evaluate().items():
+            self.logger.record(f"eval/{name}", value)
+            self.shown[f"eval_{name}"] = value
+        self.shown["evaluations"] = self.shown.get("evaluations", 0) + 1
+        elapsed = time.monotonic() - self._began
+        self.logger.record("time/total_timesteps", steps)
+        self.logger.record("time/time_elapsed", round(elapsed, 1))
+        self.logger.dump(steps)
+        if self.shown["eval_reward_per_step"] > self.best:
+            self.best = self.shown["eval_reward_per_step"]
+            save_policy(self.run.path / "best", model)
+        state = {
+            "best": self.best,
+            "elapsed": elapsed,
+            "env": base_env(model).save_state(),
+            "returns": normalisation(model).returns,
+            "random": random_state(),
+        }
+        folder = self.run.path / "checkpoints" / str(steps)
+        save_policy(folder, model, {"state.pkl": pickle.dumps(state)})
+
+    def _evaluate(self) -> dict[str, float]:
+        trained = normalisation(self.model)  # type: ignore[arg-type]
+        assert self._eval_env is not None
+        env = VecNormalize(
+            self._eval_env,
+            training=False,
+            norm_obs=trained.norm_obs,
+            norm_reward=False,
+            clip_obs=trained.clip_obs,
+        )
+        if trained.norm_obs:
+            env.obs_rms = trained.obs_rms
+        env.seed(self.run.config.seed)  # the same episodes each time, where they are random
+        return {name: float(values.mean()) for name, values in play(self.model, env).items()}
+
+
+def random_state() -> tuple[Any, ...]:
+    """The state of every random generator that Stable-Baselines3 draws from."""
+    return random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+
+
+def restore_random_state(state: tuple[Any, ...]) -> None:
+    """Go back to what `random_state` returned."""
+    python_state, numpy_state, torch_state = state
+    random.setstate(python_state)
+    np.random.set_state(numpy_state)  # noqa: NPY002
+    torch.set_rng_state(torch_state)
+
+
+def base_env(model: Any) -> MaraVecEnv:
+    """The environment under a model's normalisation."""
+    env = normalisation(model).venv
+    assert isinstance(env, MaraVecEnv)
+    return env

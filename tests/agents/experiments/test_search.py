@@ -1,0 +1,160 @@
+"""The search for hyperparameters: it goes on where it was cut off, and never tunes on seeds that are reported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+from gym_mara.agents.algorithms import presets
+from gym_mara.agents.experiments import search as module
+from gym_mara.agents.experiments.search import (
+    FIRST_SEED,
+    SPACES,
+    Search,
+    best,
+    finished,
+    open_study,
+    run_search,
+    values_of,
+    with_values,
+    work,
+)
+from gym_mara.agents.runs.evaluation import make_env
+from gym_mara.agents.runs.policy import algorithm_class
+from gym_mara.agents.training.train import new_agent, train
+from gym_mara.errors import GymMaraError, TrainingDivergedError
+
+SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
+
+
+def deaf(*arguments: Any) -> None:
+    """Nobody listens."""
+
+
+def test_a_search_goes_on_where_it_was_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds = []
+
+    def remember(config: Any, *arguments: Any, **keywords: Any) -> Any:
+        seeds.append(config.seed)
+        return train(config, *arguments, **keywords)
+
+    monkeypatch.setattr(module, "train", remember)
+    work(SMALL, tmp_path / "study", deaf)
+    study = open_study(SMALL, tmp_path / "study")
+    assert finished(study) == 2
+    more = Search(**{**vars(SMALL), "trials": 3})
+    work(more, tmp_path / "study", deaf)
+    assert finished(open_study(more, tmp_path / "study")) == 3
+    assert len(set(seeds)) == 3
+    assert min(seeds) >= FIRST_SEED
+
+
+def test_a_trial_that_was_killed_is_tried_again(tmp_path: Path) -> None:
+    study = open_study(SMALL, tmp_path)
+    first = values_of("acktr")
+    study.ask()  # and never told
+    killed = study.ask()
+    killed.suggest_float("learning_rate", *SPACES["acktr"]["learning_rate"], log=True)
+    assert run_search(SMALL, tmp_path, 1, deaf) == {}
+    trials = open_study(SMALL, tmp_path).get_trials()
+    assert not any(trial.state.name == "RUNNING" for trial in trials)
+    assert finished(study) == 2
+    ended = [trial.params for trial in trials if trial.state.name == "COMPLETE"]
+    assert ended[0] == first
+    assert ended[1]["learning_rate"] == killed.params["learning_rate"]
+
+
+def test_a_trial_that_diverges_does_not_end_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*arguments: Any, **keywords: Any) -> None:
+        raise TrainingDivergedError("the gradient is not finite")
+
+    monkeypatch.setattr(module, "train", diverge)
+    work(SMALL, tmp_path, deaf)
+    study = open_study(SMALL, tmp_path)
+    assert finished(study) == 2
+    assert best(study) is None
+
+
+def test_what_is_wrong_with_every_trial_ends_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: Any, **keywords: Any) -> None:
+        raise GymMaraError("no space left on device")
+
+    monkeypatch.setattr(module, "train", full)
+    with pytest.raises(GymMaraError, match="no space left"):
+        work(SMALL, tmp_path, deaf)
+    assert finished(open_study(SMALL, tmp_path)) == 0
+
+
+def test_a_bad_trial_is_given_up_whatever_its_rollouts_length(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Evaluations are compared by their number, not by the steps at which they happened to come."""
+    search = Search(**{**vars(SMALL), "trials": 12, "steps": 10_000})
+    played: list[int] = []
+
+    def pretend(config: Any, folder: Path, report: Any, *, preset: Any) -> str:
+        rollout = 7 * len(played) + 100  # no two alike
+        played.append(0)
+        reward = 9.0 if len(played) < 12 else -1.0
+        for number in range(1, 11):
+            shown = {"eval_reward_per_step": reward, "evaluations": number}
+            report(number * 1000 // rollout * rollout, shown)
+            report(number * 1000 // rollout * rollout + 1, shown)  # nothing new
+            played[-1] = number
+        return ""
+
+    monkeypatch.setattr(module, "train", pretend)
+    evaluated = {"reward_per_step": np.array([9.0])}
+    monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: evaluated)
+    work(search, tmp_path, deaf)
+    assert played[:11] == [10] * 11
+    assert played[11] == 2, "the third is the first that is compared"
+
+
+def test_a_search_may_be_short(tmp_path: Path) -> None:
+    short = Search(**{**vars(SMALL), "steps": 5, "trials": 1})
+    work(short, tmp_path, deaf)
+    assert best(open_study(short, tmp_path)) is not None
+
+
+def test_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    with FileLock(tmp_path / ".lock"), pytest.raises(GymMaraError, match="another process"):
+        run_search(SMALL, tmp_path, 1, deaf)
+
+
+def test_several_processes_may_search(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    assert run_search(SMALL, tmp_path, 2, deaf) == {}
+    assert finished(open_study(SMALL, tmp_path)) >= 2
+
+
+def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    with pytest.raises(GymMaraError, match="another search"):
+        open_study(Search(**{**vars(SMALL), "algo": "ppo"}), tmp_path)
+    with pytest.raises(GymMaraError, match="unknown algorithm"):
+        open_study(Search(**{**vars(SMALL), "algo": "ppo2"}), tmp_path / "other")
+
+
+@pytest.mark.parametrize("algo", SPACES)
+def test_every_value_of_a_space_is_one_that_the_algorithm_takes(algo: str) -> None:
+    chosen = {
+        name: space[-1] if isinstance(space, list) else space[1]
+        for name, space in SPACES[algo].items()
+    }
+    preset = with_values(presets.preset(algo, teleports=True), chosen)
+    env = make_env("MARA-v0", "pinocchio", preset.num_envs, {})
+    model = new_agent(algo, preset, env, seed=0)
+    assert isinstance(model, algorithm_class(algo))
+    assert model.n_steps == chosen["n_steps"]

@@ -1,0 +1,213 @@
+"""Films of a policy, and reports of its run."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from gym_mara.agents.inspection.report import write_report
+from gym_mara.agents.inspection.watch import film_run
+from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.errors import GymMaraError, MissingExtraError
+from gym_mara.rendering.film import Film
+from tests.browser import chromium
+from tests.helpers import started
+
+# Readers of films leave pipes open.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+SMALL: dict[str, Any] = {"width": 160, "height": 120}
+
+
+def pictures(film: Path) -> Any:
+    """The pictures of a film (T, height, width, 3)."""
+    if film.suffix == ".gif":
+        return np.array([np.asarray(picture)[..., :3] for picture in imageio.imiter(film)])
+    return np.asarray(imageio.imread(film, plugin="FFMPEG"))
+
+
+def differing(one: Any, other: Any) -> float:
+    """The part of two pictures' pixels that differ clearly."""
+    return float((np.abs(one.astype(int) - other.astype(int)).max(axis=-1) > 40).mean())
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_shows_the_beginning_of_an_episode(
+    finished_run: RunFolder, tmp_path: Path, suffix: str
+) -> None:
+    film = tmp_path / f"film{suffix}"
+    film_run(finished_run, film, ["dart"], SMALL, seconds=0.4)
+    shown = pictures(film)
+    if suffix == ".gif":  # the pictures of the start pose are one, shown for long
+        times = [imageio.immeta(film, index=index)["duration"] for index in range(len(shown))]
+        assert times[0] == 500
+        assert sum(times) == 900
+    else:
+        assert len(shown) == 25 + 20
+        assert differing(shown[0], shown[24]) < 0.001
+    assert shown.shape[1:] == (120, 160, 3)
+    assert differing(shown[0], shown[-1]) > 0.005, "the arm moves"
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def test_two_backends_stand_side_by_side(finished_run: RunFolder, tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
+    shown = pictures(film)
+    assert shown.shape[1:] == (120, 320, 3)
+    assert differing(shown[0, :, :160], shown[0, :, 160:]) < 0.001
+    there, on_its_way = shown[-1, :, :160], shown[-1, :, 160:]
+    assert differing(there, on_its_way) > 0.002
+
+
+@pytest.mark.parametrize(("speed", "rate"), [(0.3, 15.0), (1.0, 50.0), (3.0, 50.0)])
+def test_the_speed_of_a_film(
+    finished_run: RunFolder, tmp_path: Path, speed: float, rate: float
+) -> None:
+    film = tmp_path / "film.mp4"
+    film_run(finished_run, film, ["pinocchio"], SMALL, seconds=1.2, speed=speed)
+    properties = imageio.immeta(film, plugin="FFMPEG")
+    assert properties["fps"] == pytest.approx(rate, rel=0.01)
+    assert properties["duration"] == pytest.approx(0.5 + 1.2 / speed, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("film.avi", "unknown format of a video"),
+        ("film", "unknown format of a video"),
+        ("missing/film.mp4", "cannot be written"),
+        ("there.mp4", "exists and is not overwritten"),
+    ],
+)
+def test_a_path_that_cannot_be_written_is_told_before_anything_is_played(
+    tmp_path: Path, name: str, told: str
+) -> None:
+    (tmp_path / "there.mp4").write_text("kept")
+    with pytest.raises(GymMaraError, match=told):
+        film_run(None, tmp_path / name, ["pinocchio"], {})  # type: ignore[arg-type]
+    assert (tmp_path / "there.mp4").read_text() == "kept"
+
+
+def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+
+    def begin() -> None:
+        with Film(film, 25.0) as half:
+            half.add(np.zeros((120, 160, 3), np.uint8))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        begin()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_of_an_odd_size(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    with Film(film, 25.0) as whole:
+        for _ in range(3):
+            whole.add(np.full((101, 161, 3), 128, np.uint8))
+    assert pictures(film).shape == (3, 100, 160, 3)
+
+
+def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Path) -> None:
+    file = write_report(finished_run, tmp_path / "report.html")
+    asked, complaints = [], []
+    with chromium() as browser:
+        context = browser.new_context(offline=True)
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(file.as_uri())
+        headings = [
+            "The policy",
+            "Video",
+            "Learning curve",
+            "Error over the episode",
+            "Joint positions",
+            "Joint torques",
+            "Path of the tool",
+            "Configuration",
+        ]
+        assert page.locator("h2").all_inner_texts() == headings
+        page.locator(".js-plotly-plot .main-svg").first.wait_for()
+        assert page.locator(".js-plotly-plot").count() == 5
+        until_loaded = "video => new Promise(done => video.readyState ? done(video.duration) : (video.onloadedmetadata = () => done(video.duration)))"
+        assert page.locator("video").evaluate(until_loaded) == pytest.approx(4.5, abs=0.1)
+        played = "async video => { await video.play(); await new Promise(r => setTimeout(r, 800)); return video.currentTime; }"
+        assert page.locator("video").evaluate(played) > 0.1
+        traces = (
+            "plot => plot.data.map(trace => [trace.name, trace.x.length ?? trace.x.bdata.length])"
+        )
+        torques = page.locator(".js-plotly-plot").nth(3).evaluate(traces)
+        assert {name for name, _ in torques} == {"dart"}
+        path = page.locator(".js-plotly-plot").nth(4).evaluate(traces)
+        assert [name for name, _ in path] == ["pinocchio", "dart", "target"]
+        assert '"seed": 5' in page.locator("pre").inner_text()
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert complaints == []
+
+
+def test_a_report_overwrites_nothing_but_its_own(finished_run: RunFolder, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.html"
+    mine.write_text("kept")
+    with pytest.raises(GymMaraError, match="not overwritten"):
+        write_report(finished_run, mine)
+    assert mine.read_text() == "kept"
+    with pytest.raises(GymMaraError, match=r"cannot write.*no folder"):
+        write_report(finished_run, tmp_path / "missing" / "report.html")
+
+
+def test_without_dart_a_report_says_what_is_missing(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("gym_mara.backends.dart", "gym_mara.backends.dart_arm"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "dartpy", None)
+    text = write_report(finished_run, tmp_path / "report.html").read_text()
+    assert "gym_mara[dart]" in text
+    assert "has torques; the backend dart has" in text
+
+
+def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "gym_mara.agents.inspection.report")
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(MissingExtraError, match=r"gym_mara\[render\]"):
+        import gym_mara.agents.inspection.report  # noqa: F401
+
+
+@pytest.mark.parametrize("with_run", [True, False], ids=["run", "by hand"])
+def test_watch_serves_the_viewer_until_it_is_interrupted(
+    finished_run: RunFolder, with_run: bool
+) -> None:
+    what = [str(finished_run.path)] if with_run else ["--env", "MARAOrient-v0"]
+    port = 8300 + with_run
+    command = ["-m", "gym_mara.cli", "watch", *what]
+    command += ["--backend", "dart", "--set", f"viewer_port={port}"]
+    with started(*command) as watching:
+        deadline = time.monotonic() + 60
+        while True:
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
+                    assert b"<html" in answer.read()
+                break
+            except OSError:
+                assert time.monotonic() < deadline
+                assert watching.poll() is None
+                time.sleep(0.2)
+        time.sleep(1.0)
+        assert watching.poll() is None, "it goes on"
+        watching.send_signal(signal.SIGINT)
+        out, _ = watching.communicate(timeout=30)
+    assert watching.returncode == 130
+    assert "Closed." in out

@@ -1,0 +1,131 @@
+"""Agents on the dynamic backend: training, going on after a cut, and one policy on every backend."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gym_mara.agents.algorithms.presets import Preset
+from gym_mara.agents.inspection.transfer import SETTLED, settled_after, transfer
+from gym_mara.agents.runs.evaluation import evaluate_run, make_env
+from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.training.callbacks import Report
+from gym_mara.agents.training.train import resume, train
+from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
+from gym_mara.errors import GymMaraError
+from tests.agents.conftest import config, silent
+from tests.agents.training.test_train import assert_same_training
+
+ROLLOUT = 16 * 32
+SMALL = Preset(num_envs=16, policy="natural", arguments={"n_steps": 32, "batch_size": 128})
+
+
+def _train(out: Path, report: Report = silent, updates: int = 2) -> RunFolder:
+    """A run on the dynamic backend, with random parameters and few arms."""
+    options = {"randomisation": {"mass": [0.9, 1.1], "sensor_noise": [0.0, 1e-3]}}
+    about: dict[str, Any] = {"env": "MARA-v0", "backend": "dart", "env_options": options}
+    about |= {"steps": updates * ROLLOUT, "checkpoint_every": ROLLOUT}
+    return train(config(**about), out, report, preset=SMALL)
+
+
+@pytest.fixture(scope="module")
+def dynamic_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that was trained to its end; tests must not change it."""
+    return _train(tmp_path_factory.mktemp("dynamic") / "run")
+
+
+def test_it_trains_and_goes_on_after_a_cut_as_if_there_had_been_none(
+    dynamic_run: RunFolder, tmp_path: Path
+) -> None:
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        if steps > ROLLOUT:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _train(tmp_path / "run", cut)
+    assert_same_training(dynamic_run, resume(tmp_path / "run", silent))
+
+
+def test_a_worker_that_dies_ends_the_training_and_leaves_the_run_to_go_on_with(
+    dynamic_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[WorkerBackend] = []
+    original = WorkerBackend.__init__
+
+    def remember(self: WorkerBackend, *arguments: Any) -> None:
+        original(self, *arguments)
+        made.append(self)
+
+    def kill(steps: int, shown: dict[str, float]) -> None:
+        if steps > ROLLOUT:
+            os.kill(made[0].processes[0].pid, signal.SIGKILL)
+
+    monkeypatch.setattr(WorkerBackend, "__init__", remember)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
+    with pytest.raises(WorkerDiedError):
+        _train(tmp_path / "run", kill, updates=3)
+    run = RunFolder.open(tmp_path / "run")
+    assert [int(folder.name) for folder in run.checkpoints()] == [ROLLOUT]
+    assert resume(tmp_path / "run", silent).has_policy("last")
+
+
+def test_a_policy_plays_on_a_backend_that_it_was_not_trained_on(
+    finished_run: RunFolder, dynamic_run: RunFolder
+) -> None:
+    for run, backend in ((finished_run, "dart"), (dynamic_run, "pinocchio")):
+        metrics = evaluate_run(run, backend=backend, episodes=1)
+        assert all(np.isfinite(values).all() for values in metrics.values())
+
+
+def test_transfer_plays_a_policy_on_every_backend(dynamic_run: RunFolder) -> None:
+    rows = transfer(dynamic_run, episodes=2, options={"randomisation": {"mass": (0.5, 1.5)}})
+    of = {row.backend.split(",")[0] + str("max_joint_velocity" in row.backend): row for row in rows}
+    assert of.keys() == {"dartFalse", "pinocchioFalse", "pinocchioTrue"}
+    for row in rows:
+        for values in row[1:-2]:
+            assert np.shape(values) == (2,)
+            assert np.isfinite(values).all()
+    dynamic, teleport = of["dartFalse"], of["pinocchioFalse"]
+    assert ((dynamic.highest_torque > 0.0) & (dynamic.highest_torque <= 1.01)).all()
+    assert dynamic.highest_torque[0] != dynamic.highest_torque[1]
+    assert (dynamic.highest_velocity > 0.1).all()
+    assert np.isnan(teleport.highest_torque).all()
+    assert (teleport.highest_velocity == 0.0).all()
+    played = evaluate_run(dynamic_run, backend="pinocchio", episodes=1)
+    np.testing.assert_allclose(teleport.return_[0], played["return"][0], rtol=1e-4)
+    np.testing.assert_allclose(
+        teleport.position_error_mm[0], played["position_error_mm"][0], rtol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"options": {"colour": 1}}, "no backend knows the setting 'colour'"),
+        ({"which": "worst"}, "unknown policy"),
+    ],
+)
+def test_a_wrong_transfer(dynamic_run: RunFolder, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        transfer(dynamic_run, **arguments)
+
+
+def test_an_arm_has_settled_once_its_error_stays_near_its_last() -> None:
+    far, near = 1.0 + 2.0 * SETTLED, 1.0 + 0.5 * SETTLED
+    errors = np.array([[far, near, near], [near, far, 1.0], [near, near, near], [1.0, 1.0, 1.0]])
+    assert settled_after(errors).tolist() == [1.0, 2.0, 0.0]
+
+
+def test_a_policy_of_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
+    from gym_mara.agents.runs.policy import load_policy
+
+    env = make_env("MARAOrient-v0", "pinocchio", 1, {})
+    with pytest.raises(GymMaraError, match="does not fit the environment"):
+        load_policy(dynamic_run.policy("last"), dynamic_run.config, env)

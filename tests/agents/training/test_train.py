@@ -1,0 +1,479 @@
+"""Training: what a run leaves behind, and that it goes on after a cut as if there had been none."""
+
+from __future__ import annotations
+
+import base64
+import json
+import pickle
+import shutil
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from filelock import FileLock
+from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from gym_mara.agents.algorithms import presets
+from gym_mara.agents.runs.evaluation import METRICS, evaluate_run, make_env, spread
+from gym_mara.agents.runs.folder import DamagedRunError, RunFolder, read_progress
+from gym_mara.agents.runs.policy import POLICY_CLASSES, load_policy
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.training import callbacks
+from gym_mara.agents.training import train as train_module
+from gym_mara.agents.training.train import resume, train
+from gym_mara.errors import GymMaraError, TrainingDivergedError
+from tests.agents.conftest import ROLLOUT, config, silent
+from tests.helpers import started
+
+
+def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
+    """The weights of a run's policy."""
+    env = make_env(run.config.env, run.config.backend, 1, {})
+    policy, _ = load_policy(run.path / which, run.config, env)
+    return dict(policy.state_dict())
+
+
+def assert_same_training(run: RunFolder, other: RunFolder) -> None:
+    """The two runs learnt the same, to the bit, and logged the same but for the clock."""
+    mine, theirs = parameters(run), parameters(other)
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    tables = []
+    for folder in (run, other):
+        rows = read_progress(folder.progress_file)
+        clock = ("time/fps", "time/time_elapsed", "time/iterations")
+        tables.append([{k: v for k, v in row.items() if k not in clock} for row in rows])
+    assert tables[0] == tables[1]
+
+
+def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
+    path = finished_run.path
+    about = json.loads((path / "config.json").read_text())
+    assert about["seed"] == 5
+    assert about["preset"]["arguments"]["n_steps"] * about["preset"]["num_envs"] == ROLLOUT
+    assert {"gym_mara", "gymnasium", "torch", "pin", "python"} <= about["versions"].keys()
+    assert [int(p.name) for p in finished_run.checkpoints()] == [ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    for folder in (path / "best", path / "last", *finished_run.checkpoints()):
+        assert (folder / "model.zip").is_file()
+        assert (folder / "normalisation.json").is_file()
+    assert list((path / "tensorboard").glob("events*"))
+    assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    rows = read_progress(finished_run.progress_file)
+    assert [r["eval/position_error_mm"] > 0 for r in rows if "eval/position_error_mm" in r]
+    assert {r["time/total_timesteps"] for r in rows} == {ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT}
+
+
+def test_the_same_seed_trains_the_same_policy(finished_run: RunFolder, tmp_path: Path) -> None:
+    again = train(config(), tmp_path / "run", silent)
+    assert_same_training(finished_run, again)
+
+
+def test_another_seed_trains_another_policy(finished_run: RunFolder, tmp_path: Path) -> None:
+    other = train(config(seed=6, steps=ROLLOUT), tmp_path / "run", silent)
+    mine, theirs = parameters(finished_run), parameters(other)
+    assert not all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+@pytest.mark.parametrize("updates_before_the_cut", [1, 2])
+def test_a_cut_off_run_goes_on_as_if_it_had_not_been(
+    finished_run: RunFolder, tmp_path: Path, updates_before_the_cut: int
+) -> None:
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        # Reported at the end of a rollout: the update that follows is lost, its steps are not in a checkpoint.
+        if steps > updates_before_the_cut * ROLLOUT:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config(), tmp_path / "run", cut)
+    resumed = resume(tmp_path / "run", silent)
+    assert_same_training(finished_run, resumed)
+
+
+def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = ["-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
+    with started(*command, "--checkpoint-every", str(ROLLOUT)) as process:
+        deadline = time.monotonic() + 120
+        while not (run / "checkpoints" / str(2 * ROLLOUT)).is_dir():
+            assert process.poll() is None, "the training ended early"
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    reached = int(RunFolder.open(run).checkpoints()[-1].name)
+    text = (run / "config.json").read_text()
+    (run / "config.json").write_text(text.replace("10000000", str(reached + ROLLOUT)))
+    seen: list[int] = []
+    resumed = resume(run, lambda steps, shown: seen.append(steps))
+    assert seen[0] == reached
+    assert resumed.has_policy("last")
+
+
+def test_a_run_cut_off_before_its_first_checkpoint_begins_anew(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        if steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config(), tmp_path / "run", cut)
+    assert_same_training(finished_run, resume(tmp_path / "run", silent))
+
+
+def test_a_run_cut_off_after_its_last_checkpoint_is_finished(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    shutil.copytree(finished_run.path, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "last")
+    (tmp_path / "run" / "learning_curve.png").unlink()
+    resumed = resume(tmp_path / "run", silent)
+    assert_same_training_but_log(finished_run, resumed)
+    assert (resumed.path / "learning_curve.png").is_file()
+
+
+def test_the_curve_is_drawn_before_a_run_counts_as_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(run: RunFolder) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(callbacks, "plot_learning_curve", kill)
+        with pytest.raises(KeyboardInterrupt):
+            train(config(), tmp_path / "run", silent)
+    resumed = resume(tmp_path / "run", silent)
+    assert (resumed.path / "learning_curve.png").is_file()
+
+
+def assert_same_training_but_log(run: RunFolder, other: RunFolder) -> None:
+    """The two runs ended with the same policy."""
+    mine, theirs = parameters(run), parameters(other)
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+def test_a_finished_run_is_not_resumed(finished_run: RunFolder) -> None:
+    with pytest.raises(GymMaraError, match="has finished"):
+        resume(finished_run.path, silent)
+
+
+def test_a_folder_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(GymMaraError, match="not overwritten"):
+        train(config(), tmp_path, silent)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algo": "pop"}, "unknown algorithm 'pop'. Did you mean 'ppo'"),
+        ({"env": "MARA-v9"}, "unknown task 'MARA-v9'.*MARACollision-v0"),
+        ({"backend": "gazebo"}, "unknown backend 'gazebo'.*pinocchio"),
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
+        ({"env_options": {"colour": "red"}}, "unknown keyword argument 'colour'"),
+        ({"seed": -1}, "seed must be a whole number from 0"),
+        ({"seed": 2**32}, "seed must be a whole number from 0"),
+    ],
+)
+def test_a_wrong_configuration_leaves_no_folder(
+    tmp_path: Path, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        train(config(**changes), tmp_path / "run", silent)
+    assert not (tmp_path / "run").exists()
+
+
+def test_evaluation_reports_each_metric_of_each_episode(finished_run: RunFolder) -> None:
+    metrics = evaluate_run(finished_run, episodes=3)
+    assert tuple(metrics) == METRICS
+    assert all(values.shape == (3,) for values in metrics.values())
+    # Start pose and policy are the same in every episode, and so, but for rounding, is what comes of them.
+    for name, values in metrics.items():
+        np.testing.assert_allclose(values, values[0], rtol=1e-5, err_msg=name)
+    np.testing.assert_allclose(metrics["return"], 2048 * metrics["reward_per_step"], rtol=1e-9)
+    summary = spread(metrics)
+    assert summary["return"].keys() == {"mean", "std", "min", "max"}
+
+
+def test_evaluation_plays_what_the_policy_was_trained_for(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    options = {"max_joint_velocity": 1.0, "start_q": [0.1] * 6}
+    run = train(config(steps=ROLLOUT, env_options=options), tmp_path / "run", silent)
+    assert RunFolder.open(run.path).config.env_options == options
+    assert (
+        evaluate_run(run, episodes=1)["return"] != evaluate_run(finished_run, episodes=1)["return"]
+    )
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_evaluation_wants_an_episode(finished_run: RunFolder, episodes: int) -> None:
+    with pytest.raises(GymMaraError, match="episodes must be at least 1"):
+        evaluate_run(finished_run, episodes=episodes)
+
+
+def copy_of(run: RunFolder, path: Path) -> RunFolder:
+    """A run that a test may damage."""
+    shutil.copytree(run.path, path)
+    return RunFolder.open(path)
+
+
+@pytest.mark.parametrize("file", ["model.zip", "normalisation.json"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a bit"])
+def test_a_damaged_policy_is_named(
+    finished_run: RunFolder, tmp_path: Path, file: str, damage: str
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    victim = run.path / "last" / file
+    content = victim.read_bytes()
+    victim.unlink()
+    gone = damage == "missing" and file == "model.zip"
+    if damage in ("empty", "cut"):
+        victim.write_bytes(content[: 0 if damage == "empty" else len(content) // 2])
+    elif damage == "a bit":
+        middle = len(content) // 2
+        flipped = bytes([content[middle] ^ 128])
+        victim.write_bytes(content[:middle] + flipped + content[middle + 1 :])
+    with pytest.raises(GymMaraError, match="has no 'last'" if gone else "damaged"):
+        evaluate_run(run)
+
+
+@pytest.mark.parametrize("part", ["data", "policy.pth", "pytorch_variables.pth"])
+def test_a_checkpoint_with_a_flipped_bit_is_named(
+    finished_run: RunFolder, tmp_path: Path, part: str
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    file = run.checkpoints()[-1] / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        about = archive.getinfo(part)
+    content = bytearray(file.read_bytes())
+    content[about.header_offset + 60 + about.compress_size // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(DamagedRunError, match="damaged"):
+        resume(run.path, silent)
+
+
+# Compressed in another way, encrypted, of a later version of the format.
+@pytest.mark.parametrize(("place", "bit"), [(10, 64), (8, 1), (6, 128)])
+def test_a_policy_whose_directory_of_parts_has_a_flipped_bit_is_named(
+    finished_run: RunFolder, tmp_path: Path, place: int, bit: int
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    file = run.path / "last" / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        directory = archive.start_dir
+    content = bytearray(file.read_bytes())
+    content[directory + place] ^= bit
+    file.write_bytes(content)
+    with pytest.raises(DamagedRunError, match="damaged"):
+        evaluate_run(run, episodes=1)
+
+
+def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    trap = tmp_path / "trap"
+    file = run.path / "last" / "model.zip"
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    about = json.loads(parts["data"])
+    pickled = base64.b64encode(pickle.dumps(Trap(trap))).decode()
+    about["clip_range"] = {":type:": "", ":serialized:": pickled}
+    parts["data"] = json.dumps(about).encode()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    evaluate_run(run, episodes=1)
+    assert not trap.exists()
+    PPO.load(file)
+    assert trap.exists(), "Stable-Baselines3's own way runs it"
+
+
+class Trap:
+    """Makes a file where it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _spring, (self.path,)
+
+
+def _spring(path: Path) -> float:
+    path.touch()
+    return 0.2
+
+
+def test_a_damaged_checkpoint_is_named(finished_run: RunFolder, tmp_path: Path) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    (run.checkpoints()[-1] / "state.pkl").write_bytes(b"")
+    with pytest.raises(GymMaraError, match=r"damaged.*go on from the one before"):
+        resume(run.path, silent)
+
+
+def test_a_policy_of_another_environment_is_refused(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    file = run.path / "config.json"
+    file.write_text(file.read_text().replace("MARACollisionOrient-v0", "MARA-v0"))
+    with pytest.raises(GymMaraError, match="does not fit the environment"):
+        evaluate_run(RunFolder.open(run.path))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"steps": "many"},
+        {"seed": 1.5},
+        {"checkpoint_every": True},
+        {"env": None},
+        {"env_options": []},
+        {"preset": {}},
+        {"preset": []},
+        {"preset": {"num_envs": 1, "colour": "red"}},
+        {"preset": {"num_envs": "many"}},
+        {"preset": {"num_envs": 1, "policy": "mpl"}},
+    ],
+)
+def test_a_configuration_of_another_form_is_named(
+    finished_run: RunFolder, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    values = json.loads((finished_run.path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(values | change))
+    with pytest.raises(DamagedRunError, match="damaged"):
+        RunFolder.open(tmp_path)
+
+
+def test_a_preset_of_an_unknown_policy_is_refused() -> None:
+    with pytest.raises(GymMaraError, match=r"unknown policy 'mpl'\. Did you mean 'mlp'"):
+        presets.Preset(num_envs=1, policy="mpl")
+    assert tuple(POLICY_CLASSES) == presets.POLICY_FORMS
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    table = run.progress_file.read_bytes()
+    with monkeypatch.context() as patch, FileLock(run.path / ".lock"):
+        patch.delattr(train_module, "load_model")  # what the other may be writing is not read
+        with pytest.raises(GymMaraError, match="another process"):
+            resume(run.path, silent)
+    assert run.progress_file.read_bytes() == table
+    assert resume(run.path, silent).has_policy("last")
+
+
+def test_a_run_in_training_is_not_resumed(tmp_path: Path) -> None:
+    refused: list[int] = []
+
+    def meddle(steps: int, shown: dict[str, float]) -> None:
+        with pytest.raises(GymMaraError, match="another process"):
+            resume(tmp_path / "run", silent)
+        refused.append(steps)
+
+    train(config(), tmp_path / "run", meddle)
+    assert refused == [ROLLOUT * n for n in range(4)]
+
+
+def test_a_resumed_tensorboard_log_has_every_step_once(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    resume(run.path, silent)
+    log = EventAccumulator(str(run.path / "tensorboard"))
+    log.Reload()
+    steps = [event.step for event in log.Scalars("rollout/reward_per_step")]
+    assert steps == [ROLLOUT * (n + 1) for n in range(3)]
+
+
+# The parameters are NaN; the standard deviation has overflowed; a matrix of the policy cannot be factored; K-FAC's step
+# is not finite.
+@pytest.mark.parametrize(
+    ("algo", "preset_name", "wild"),
+    [
+        ("ppo", "tuned", {"learning_rate": 1e30}),
+        ("ppo", "paper", {"learning_rate": 1e10}),
+        ("trpo", "tuned", {"target_kl": 1e5}),
+        ("acktr", "tuned", {"learning_rate": 1e30}),
+    ],
+)
+def test_a_training_that_diverges_says_so(
+    tmp_path: Path, algo: str, preset_name: str, wild: dict[str, float]
+) -> None:
+    preset = presets.preset(algo, preset_name, teleports=True)
+    preset = replace(preset, arguments={**preset.arguments, **wild})
+    asked = config(algo=algo, steps=6000, checkpoint_every=6000)
+    with pytest.raises(TrainingDivergedError, match="finite"):
+        train(asked, tmp_path / "run", silent, preset=preset)
+
+
+def test_a_training_that_fails_otherwise_says_what_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> None:
+        raise ValueError("something else")
+
+    monkeypatch.setattr(callbacks, "save_policy", fail)
+    with pytest.raises(ValueError, match="something else") as caught:
+        train(config(), tmp_path / "run", silent)
+    assert not isinstance(caught.value, TrainingDivergedError)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_however_a_training_ends_its_environments_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    opened: list[MaraVecEnv] = []
+    closed: list[MaraVecEnv] = []
+    begin, close = MaraVecEnv.__init__, MaraVecEnv.close
+
+    def note_beginning(env: MaraVecEnv, *arguments: Any) -> None:
+        opened.append(env)
+        begin(env, *arguments)
+
+    def note_end(env: MaraVecEnv) -> None:
+        closed.append(env)
+        close(env)
+
+    def cut(steps: int, shown: dict[str, float]) -> None:
+        if steps:
+            raise error
+
+    monkeypatch.setattr(MaraVecEnv, "__init__", note_beginning)
+    monkeypatch.setattr(MaraVecEnv, "close", note_end)
+    with pytest.raises(error):
+        train(config(), tmp_path / "run", cut)
+    assert len(opened) == 3  # to ask whether joints teleport, to train, to evaluate
+    assert {id(env) for env in opened} == {id(env) for env in closed}
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", '{"env": "MARA-v0", "versions": {}}'])
+def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(GymMaraError, match="damaged"):
+        RunFolder.open(tmp_path)
+
+
+def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(GymMaraError, match="no run folder"):
+        RunFolder.open(tmp_path)
+
+
+def test_an_unfinished_run_has_no_last_policy(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    run = RunFolder(tmp_path / "run", config())
+    with pytest.raises(GymMaraError, match="has no 'last' policy"):
+        evaluate_run(run)
