@@ -46,7 +46,7 @@ clean: ## Remove the virtual environments and what the tools left.
 CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
 TESTS ?=
-GYMNASIUM_TESTS = $(filter-out tests/test_examples.py,$(wildcard tests/test_*.py)) tests/rendering/test_pictures.py tests/agents/test_sb3.py
+GYMNASIUM_TESTS = $(filter-out tests/test_examples.py,$(wildcard tests/test_*.py)) tests/envs tests/rendering/test_pictures.py tests/agents/test_sb3.py
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)

@@ -13,8 +13,8 @@ import numpy as np
 from speed import PEERS, batch, rates, row, single
 
 import gym_mara  # noqa: F401 - registers the environments
-from gym_mara.backends.dart import DartBackend
-from gym_mara.backends.dart_arm import DartArm
+from gym_mara.backends.dart.arm import DartArm
+from gym_mara.backends.dart.backend import DartBackend
 from gym_mara.robot import RobotModel
 
 ENV_ID = "gym_mara/MARACollisionOrient-v0"

@@ -17,6 +17,6 @@ for _name in TASKS:
 
 register(
     id="gym_mara/MARAGoal-v0",
-    entry_point="gym_mara.goal_env:MaraGoalEnv",
+    entry_point="gym_mara.envs:MaraGoalEnv",
     max_episode_steps=50,
 )

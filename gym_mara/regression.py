@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.reachability import solve_ik
-from gym_mara.simulation import Simulation
+from gym_mara.robot.inverse_kinematics import solve_ik
 
 Floats = NDArray[np.float64]
 

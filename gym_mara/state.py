@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gym_mara.types import Floats, Mask
+
+
+class Contact(NamedTuple):
+    """Two links in contact."""
+
+    links: tuple[str, str]
+    """Their names, in alphabetical order."""
+    depth: float
+    """The deepest penetration during the last control period, m."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,6 +42,14 @@ class SimState:
     """(N,): links that may collide touched at this instant or at any during the last control period."""
     time: NDArray[np.float64]
     """Simulated time since the arm's last reset (N,), s."""
+    torque: Floats | None = None
+    """What the motors exerted in the last physics step (N, J), Nm (N for a prismatic joint); None without dynamics."""
+    contacts: tuple[tuple[Contact, ...], ...] | None = None
+    """The contacts of each arm during the last control period, N tuples; None where an engine reports none."""
+    diverged: Mask | None = None
+    """(N,): the arm's state diverged in the last step, and the one before is reported; None where that cannot be."""
+    parameters: Mapping[str, Floats] | None = None
+    """What was drawn for each arm's episode, name → (N, …); None where nothing is random."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from gym_mara.backends import Backend
 from gym_mara.backends.servo import servo_motion, step_times
+from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import make_checker
 from gym_mara.robot.kinematics import motion_axis
 from gym_mara.state import SimState
 

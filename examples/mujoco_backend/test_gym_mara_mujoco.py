@@ -15,10 +15,10 @@ import pytest
 from gym_mara_mujoco import MujocoBackend, build_model
 
 from gym_mara.backends import make_backend
+from gym_mara.collision import make_checker
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import make_checker
 from gym_mara.testing import BackendContract, Make, uniform_q
 
 # A slide that carries a pendulum: another kind of joint, of shape, and friction and damping. It cannot hold its pole.

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
+from gym_mara.collision import make_checker
+from gym_mara.collision.base import CollisionChecker
+from gym_mara.collision.cached import CachedChecker
+from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import (
-    CoalChecker,
-    CollisionChecker,
-    ParallelCoalChecker,
-    RememberingChecker,
-    make_checker,
-)
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]
@@ -73,7 +70,7 @@ class PinocchioBackend(Backend):
         elif num_envs >= REMEMBER_FROM and isinstance(
             self._checker, (CoalChecker, ParallelCoalChecker)
         ):
-            self._checker = RememberingChecker(robot, self._checker)
+            self._checker = CachedChecker(robot, self._checker)
         self._kinematics = robot.kinematics()
         self._q = np.tile(robot.home, (num_envs, 1))
         self._qd = np.zeros_like(self._q)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gym_mara import rotations
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
-from gym_mara.robot.reachability import FreePoses
+from gym_mara.robot.inverse_kinematics import FreePoses
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]

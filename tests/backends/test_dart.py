@@ -9,11 +9,12 @@ import pinocchio as pin
 import pytest
 
 from gym_mara.backends import make_backend
-from gym_mara.backends.dart import DartBackend, SimulationDivergedError
-from gym_mara.backends.dart_arm import DETECTORS, DartArm
+from gym_mara.backends.dart.arm import DETECTORS, DartArm
+from gym_mara.backends.dart.backend import DartBackend, SimulationDivergedError
+from gym_mara.collision import make_checker
+from gym_mara.collision.coal import approach_bounds
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import approach_bounds, make_checker
 from gym_mara.testing import COLLIDING_Q, uniform_q
 from tests.helpers import Floats, robot_model
 

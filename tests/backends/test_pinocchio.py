@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gym_mara.backends.pinocchio import PinocchioBackend
+from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import make_checker
 from gym_mara.testing import COLLIDING_Q, assert_same_state, uniform_q
 from tests.helpers import PATH_ENDS, Floats, robot_model
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gym_mara.backends import Backend, make_backend
-from gym_mara.backends.dart import SimulationDivergedError
+from gym_mara.backends.dart.backend import SimulationDivergedError
 from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.robot import catalog
-from gym_mara.robot.collision import make_checker
 from tests.helpers import robot_model
 
 

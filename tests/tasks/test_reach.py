@@ -13,7 +13,7 @@ import pytest
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.reachability import solve_ik
+from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.rotations import canonical, conjugate, multiply
 from gym_mara.state import SimState
 from gym_mara.tasks import PAPER_TASKS, TASKS, ReachTask, Task, make_task

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
 
-from gym_mara.statistics import EpisodeStatistics
+from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.testing import COPIES
 from tests.helpers import Floats
 

@@ -13,9 +13,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.statistics import EpisodeStatistics
 from gym_mara.testing import COLLIDING_Q, COPIES, pickled
 from tests.helpers import ENV_IDS, TASK_NAMES, Floats
 

@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from gym_mara.collision.base import CollisionChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
-from gym_mara.robot.collision import CollisionChecker
 from gym_mara.robot.model import RobotModel
 
 with needs("the collision engine 'fcl'", "fcl"):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gym_mara.collision import make_checker
 from gym_mara.robot.catalog import robot_names
-from gym_mara.robot.collision import make_checker
-from gym_mara.robot.reachability import miss, reachable_pose, solve_ik
+from gym_mara.robot.inverse_kinematics import miss, reachable_pose, solve_ik
 from gym_mara.rotations import angle_between
 from gym_mara.testing import uniform_q
 from tests.helpers import robot_model

@@ -23,10 +23,10 @@ from gym_mara.rendering.settings import RenderSettings
 with needs("the viewer", "render", "viser"):
     import viser
 
-from gym_mara.rendering.stage import Stage
+from gym_mara.viewer.stage import Stage
 
 if TYPE_CHECKING:
-    from gym_mara.simulation import Outcome, Simulation
+    from gym_mara.envs.simulation import Outcome, Simulation
 
 _FRAME_PERIOD = 1.0 / 30.0
 """Between two pictures in the browser, s."""

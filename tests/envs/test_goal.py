@@ -14,9 +14,9 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.goal import MaraGoalEnv
 from gym_mara.errors import GymMaraError
-from gym_mara.goal_env import MaraGoalEnv
-from gym_mara.robot.reachability import miss
+from gym_mara.robot.inverse_kinematics import miss
 from gym_mara.testing import COLLIDING_Q, COPIES
 from tests.helpers import TARGET_Q, robot_model
 

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 
 from gym_mara import rotations
-from gym_mara.envs import MaraEnv
+from gym_mara.envs.single import MaraEnv
 from gym_mara.errors import GymMaraError, positive_number, unknown
 from gym_mara.tasks import Goal, ReachTask, Task
 

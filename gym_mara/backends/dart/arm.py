@@ -9,10 +9,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from gym_mara.collision.base import CollisionChecker, NoChecker
+from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import CoalChecker, CollisionChecker, NoChecker
 from gym_mara.robot.kinematics import motion_axis
 
 with needs("the backend 'dart'", "dart"):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
-from gym_mara.backends.dart_arm import Contact, DartArm, is_lost
+from gym_mara.backends.dart.arm import Contact, DartArm, is_lost
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import servo_motion, step_times
 from gym_mara.errors import GymMaraError, positive_number, unknown

@@ -6,8 +6,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from gym_mara.collision import make_checker
+from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.collision import CoalChecker, make_checker
 from gym_mara.robot.model import RobotModel
 
 Floats = NDArray[np.float64]

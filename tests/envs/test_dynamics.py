@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from gym_mara.backends.dart import DartBackend, SimulationDivergedError
+from gym_mara.backends.dart.backend import DartBackend, SimulationDivergedError
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.testing import COLLIDING_Q, COPIES
@@ -209,7 +209,7 @@ def test_dart_that_is_not_installed_is_named_with_its_extra(
 ) -> None:
     import sys
 
-    for module in ("gym_mara.backends.dart", "gym_mara.backends.dart_arm"):
+    for module in [name for name in sys.modules if name.startswith("gym_mara.backends.dart")]:
         monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setitem(sys.modules, "dartpy", None)
     with pytest.raises(GymMaraError, match=r"pip install 'gym_mara\[dart\]'"):

@@ -1,139 +1,25 @@
-"""The environments: MaraEnv for one arm, MaraVectorEnv for many at once."""
+"""MaraVectorEnv: many arms in one batch."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from gym_mara.envs.simulation import Mask, Simulation
+from gym_mara.envs.single import checked_render_mode
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.robot import RobotLike
-from gym_mara.simulation import Mask, Simulation
 from gym_mara.tasks import Task
 
-if TYPE_CHECKING:
-    from gym_mara.rendering.viewer import Viewer
-
 Floats = NDArray[np.float64]
-
-
-class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
-    """One arm.
-
-    The observation is the task's, (O,); the action holds absolute joint targets (J,), rad. `info` carries the terms of
-    the reward, `collided`, and `statistics`, those of the episode so far (`gym_mara.statistics`).
-
-    Args:
-        task: the name of a task, such as "MARA-v0", or a Task.
-        robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
-        ee_frame: the end-effector link of a URDF of your own.
-        backend: the name of a backend.
-        render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
-        **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
-            (`max_joint_velocity`, …) and of pictures (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`).
-
-    Raises:
-        GymMaraError: a name is unknown, or a value is out of its range.
-        MissingExtraError: a library is not installed.
-    """
-
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012 - Gymnasium's form
-
-    def __init__(
-        self,
-        task: str | Task = "MARA-v0",
-        *,
-        robot: RobotLike = "mara",
-        ee_frame: str | None = None,
-        backend: str = "pinocchio",
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        self.render_mode = _checked_render_mode(render_mode, self.metadata["render_modes"])
-        self._rendering, options = RenderSettings.split(options)
-        others = RenderSettings.names()
-        self.simulation = Simulation(task, 1, robot, ee_frame, backend, options, others)
-        self._pictures = Pictures(self.simulation.robot, self._rendering)
-        self.viewer: Viewer | None = None
-        self.observation_space = self.simulation.observation_space  # type: ignore[assignment]
-        self.action_space = self.simulation.action_space
-        self.metadata = self.metadata | {"render_fps": 1.0 / self.simulation.backend.control_period}
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start pose; `options` has no meaning yet."""
-        super().reset(seed=seed)
-        observation = self.simulation.reset((self.np_random,))[0]
-        if self.render_mode == "human":
-            self._show()
-        return observation, _info_of_one(self.simulation.backend.report())
-
-    def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Move towards the joint targets (J,), rad, for one control period.
-
-        Raises:
-            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
-        """
-        targets: Any = np.asarray(action)[None]
-        if self.viewer is not None:
-            targets = self.viewer.before_step(self.simulation, targets)
-        outcome = self.simulation.step(targets)
-        if self.viewer is not None:
-            self.viewer.after_step(self.simulation, outcome)
-        info = _info_of_one(outcome.info)
-        # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
-        info["statistics"] = self.simulation.statistics.of(0)
-        terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
-        return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
-
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The picture of what the last observation shows, uint8 (height, width, 3); None but for "rgb_array".
-
-        Raises:
-            MissingExtraError: no renderer is installed.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn("render() draws nothing: give render_mode='rgb_array' or 'human'")
-        if self.render_mode != "rgb_array":
-            return None
-        return self._pictures.of(self.simulation.view(0))
-
-    def _show(self) -> None:
-        """Show the arm in the viewer, which is made when the first episode begins."""
-        if self.viewer is None:
-            from gym_mara.rendering.viewer import Viewer
-
-            self.viewer = Viewer(self.simulation, self._rendering)
-        self.viewer.show(self.simulation)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"viewer": None}  # a copy gets its own when it is reset
-
-    def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arm, the episode and the random generator; it pickles."""
-        return self.simulation.save() | {"np_random": copy.deepcopy(self.np_random)}
-
-    def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot of an environment made alike."""
-        self.simulation.restore(snapshot)
-        self.np_random = copy.deepcopy(snapshot["np_random"])
-
-    def close(self) -> None:
-        """Free the backend, the renderer and the viewer."""
-        self._pictures.close()
-        if self.viewer is not None:
-            self.viewer.close()
-            self.viewer = None
-        self.simulation.close()
 
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
@@ -167,7 +53,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         **options: Any,
     ) -> None:
         self.closed = True  # until it is whole: Gymnasium closes even what could not be made
-        self.render_mode = _checked_render_mode(render_mode, ["rgb_array"])
+        self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
         rendering, options = RenderSettings.split(options)
@@ -317,22 +203,11 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.simulation.close()
 
 
-def _checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
-    if render_mode is not None and render_mode not in known:
-        raise unknown("render_mode", render_mode, known)
-    return render_mode
-
-
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError:
         raise unknown("autoreset_mode", mode, [m.value for m in AutoresetMode]) from None
-
-
-def _info_of_one(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """A batch of infos of one arm as plain numbers, arrays and objects."""
-    return {name: v.item() if v.ndim == 1 else v[0] for name, v in values.items()}
 
 
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:

@@ -10,14 +10,12 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from gym_mara.collision import make_checker
+from gym_mara.collision.base import CollisionChecker
+from gym_mara.collision.cached import CachedChecker
+from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.collision import (
-    CoalChecker,
-    CollisionChecker,
-    RememberingChecker,
-    make_checker,
-)
 from gym_mara.testing import COLLIDING_Q, COPIES, uniform_q
 from tests.helpers import PATH_ENDS, TARGET_Q, Floats, robot_model
 
@@ -132,7 +130,7 @@ def test_two_checkers_of_one_robot_do_not_disturb_each_other(mara: RobotModel) -
 def test_to_remember_where_there_was_room_changes_no_answer(name: str) -> None:
     robot, exact = robot_model(name), _checker("coal", name)
     assert isinstance(exact, CoalChecker)
-    checker = RememberingChecker(robot, CoalChecker(robot))
+    checker = CachedChecker(robot, CoalChecker(robot))
     rng = np.random.default_rng(0)
     centre, asked, hits = uniform_q(robot, 24, seed=1), 0, 0
     checker._exact = SpiedChecker(robot)
@@ -160,7 +158,7 @@ class SpiedChecker(CoalChecker):
 
 def test_arms_that_stay_with_room_around_them_are_not_checked(mara: RobotModel) -> None:
     spied = SpiedChecker(mara)
-    checker = RememberingChecker(mara, spied)
+    checker = CachedChecker(mara, spied)
     q = np.tile(TARGET_Q, (16, 1))
     for step in range(20):
         assert not checker.check(q + 1e-4 * step).any()

@@ -1,0 +1,38 @@
+"""Collision checking: does an arm collide at these configurations? One interface, and the engines behind it."""
+
+from __future__ import annotations
+
+from gym_mara.collision.base import CollisionChecker, NoChecker
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.robot import RobotModel
+
+__all__ = ["CollisionChecker", "make_checker"]
+
+
+def make_checker(name: str, robot: RobotModel, threads: int = 1) -> CollisionChecker:
+    """The checker of this name: "coal", "fcl", or "none", which sees no collision.
+
+    Args:
+        name: the engine.
+        robot: the arm.
+        threads: how many threads Coal may use for many configurations.
+
+    Raises:
+        GymMaraError: the name is neither, or the engine has no such number of threads.
+        MissingExtraError: the engine is not installed.
+    """
+    if threads < 1 or (threads > 1 and name != "coal"):
+        raise GymMaraError(
+            f"collision_threads must be at least 1, and 1 but for 'coal'; not {threads} for {name!r}"
+        )
+    if name == "coal":
+        from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
+
+        return CoalChecker(robot) if threads == 1 else ParallelCoalChecker(robot, threads)
+    if name == "fcl":
+        from gym_mara.collision.fcl import FclChecker
+
+        return FclChecker(robot)
+    if name == "none":
+        return NoChecker(robot)
+    raise unknown("collision engine", name, ("coal", "fcl", "none"))
