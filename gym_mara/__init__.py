@@ -2,7 +2,7 @@
 
 from gymnasium.envs.registration import register
 
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
 
 __version__ = "0.1.0"
 
@@ -12,7 +12,7 @@ for _name in TASKS:
         entry_point="gym_mara.envs:MaraEnv",
         vector_entry_point="gym_mara.envs:MaraVectorEnv",
         kwargs={"task": _name},
-        max_episode_steps=2048,
+        max_episode_steps=MAX_EPISODE_STEPS,
     )
 
 register(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.inverse_kinematics import solve_ik
@@ -70,7 +71,7 @@ def record(
     """
     if states < 2:
         raise GymMaraError(f"states must be at least 2, not {states}")
-    simulation = Simulation(env, 1, **_robot(options or {}), backend=backend)
+    simulation = _simulation(env, backend, options or {}, 1)
     try:
         q = _grid(simulation, states)
     finally:
@@ -86,7 +87,7 @@ def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Reco
     """
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
-    simulation = Simulation(env, len(q), **_robot(options), backend=backend)
+    simulation = _simulation(env, backend, options, len(q))
     try:
         for number, row in enumerate(q):
             simulation.robot.checked_q(row, f"state {number} of the record")
@@ -177,14 +178,11 @@ def read(file: Path) -> Record:
         raise GymMaraError(f"{str(file)!r} is no reward record: {error}") from error
 
 
-def _robot(options: dict[str, Any]) -> dict[str, Any]:
-    """The options as Simulation takes them."""
-    rest = {k: v for k, v in options.items() if k not in ("robot", "ee_frame")}
-    return {
-        "robot": options.get("robot", "mara"),
-        "ee_frame": options.get("ee_frame"),
-        "options": rest,
-    }
+def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
+    """N arms, with the keyword arguments that an environment takes."""
+    rest = {name: v for name, v in options.items() if name not in ("robot", "ee_frame")}
+    robot, ee_frame = options.get("robot", "mara"), options.get("ee_frame")
+    return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
 
 
 def _grid(simulation: Simulation, states: int) -> Floats:

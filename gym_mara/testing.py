@@ -50,7 +50,8 @@ def uniform_q(robot: RobotModel, count: int, seed: int) -> Floats:
 
 def arrays_of(state: SimState) -> dict[str, NDArray[Any]]:
     """The arrays of a state by name."""
-    return {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    values = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def assert_same_arrays(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import threading
@@ -37,25 +38,27 @@ settings.load_profile("gym_mara")
 @pytest.fixture(autouse=True)
 def _no_process_is_left_behind() -> Iterator[None]:
     """Kill the processes that a test has started and not ended, and fail the test."""
-    before = set(_children())
+    before = set(psutil.Process().children())
     yield
     deadline = time.monotonic() + _GRACE
-    while (left := set(_children()) - before) and time.monotonic() < deadline:
+    while (left := _new_children(before)) and time.monotonic() < deadline:
+        gc.collect()  # what a test has dropped without closing it ends its processes
         time.sleep(0.05)
     commands = []
     for process in left:
         with contextlib.suppress(psutil.NoSuchProcess):
             commands.append(" ".join(process.cmdline()))
-            process.kill()
+            for each in (process, *process.children(recursive=True)):
+                each.kill()
     assert not commands, f"the test left processes behind: {commands}"
 
 
-def _children() -> list[psutil.Process]:
-    """The living descendants of this process, without those that multiprocessing keeps."""
+def _new_children(before: set[psutil.Process]) -> list[psutil.Process]:
+    """The living child processes that were not there before, without those that multiprocessing keeps."""
     children = []
-    for process in psutil.Process().children(recursive=True):
+    for process in set(psutil.Process().children()) - before:
         with contextlib.suppress(psutil.NoSuchProcess):
-            command = " ".join(process.cmdline())
+            command = " ".join(process.cmdline())  # empty once it is a zombie
             if command and not any(name in command for name in _LASTING):
                 children.append(process)
     return children

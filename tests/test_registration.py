@@ -85,9 +85,16 @@ def test_importing_the_package_imports_no_environment_code(tmp_path: Path) -> No
     code = f"""
 import json, sys, gym_mara
 unneeded = {NOT_NEEDED!r} + ("gym_mara.envs", "gym_mara.agents", "gym_mara.backends.pinocchio")
+unneeded += ("pinocchio", "coal", "scipy")
 print(json.dumps([m for m in unneeded if m in sys.modules]))
 """
     assert json.loads(_run(code, tmp_path)) == []
+
+
+def test_importing_the_package_costs_at_most_30_ms_more_than_gymnasium(tmp_path: Path) -> None:
+    # Of processor time, the least of several: other processes are at work here.
+    code = "import gymnasium, time; t = time.process_time(); import gym_mara; print(time.process_time() - t)"
+    assert min(float(_run(code, tmp_path)) for _ in range(5)) <= 0.030
 
 
 @pytest.mark.parametrize("name", ENV_IDS)

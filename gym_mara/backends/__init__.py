@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Sequence
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -13,7 +12,7 @@ from gym_mara.backends.workers import WorkerBackend, choose_workers
 from gym_mara.errors import unknown
 from gym_mara.robot import RobotModel
 
-__all__ = ["Backend", "backend_names", "make_backend"]
+__all__ = ["Backend", "backend_names", "backend_settings", "make_backend"]
 
 # Imported when first used: "module:class".
 _BACKENDS = {
@@ -65,7 +64,6 @@ def make_backend(
     robot: RobotModel,
     num_envs: int,
     options: dict[str, Any],
-    others: Sequence[str] = (),
 ) -> Backend:
     """A backend of this name for N arms, with settings of its own.
 
@@ -74,7 +72,6 @@ def make_backend(
         robot: the arm.
         num_envs: N.
         options: the settings.
-        others: what else is a keyword argument where these come from; an error about an unknown one names them too.
 
     Raises:
         GymMaraError: the name or a setting is unknown, or a setting is out of its range.
@@ -83,9 +80,7 @@ def make_backend(
     backend, settings = backend_class(name), backend_settings(name)
     for option in options:
         if option not in settings:
-            raise unknown(
-                "keyword argument", option, [*settings, *others], f" with backend {name!r}"
-            )
+            raise unknown("keyword argument", option, settings, f" with backend {name!r}")
     if not backend.in_processes:
         return backend(robot, num_envs, **options)
     options = dict(options)

@@ -5,18 +5,20 @@ docs/from_gym_gazebo2.md maps its flags and scripts.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from gymnasium.envs.registration import register
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError, positive_number, whole_number
-from gym_mara.tasks import PAPER_TASKS
-
-Floats = NDArray[np.float64]
+from gym_mara.robot import RobotModel
+from gym_mara.robot.kinematics import Kinematics
+from gym_mara.state import SimState
+from gym_mara.tasks import MAX_EPISODE_STEPS, PAPER_TASKS, Goal, Observation, Part
+from gym_mara.types import Floats
 
 RUN_VELOCITY = 0.5
 """How fast the joints are in gym-gazebo2's run mode by default, rad/s."""
@@ -67,27 +69,18 @@ class GazeboMaraEnv(MaraEnv):
         if gui:
             options["render_mode"] = "human"
         super().__init__(task, **options)
-        self._episode_size = 2048
-        self._slip = original_observation
+        self._episode_size = MAX_EPISODE_STEPS
         if original_observation:
-            robot, space = self.simulation.robot, self.simulation.observation_space
-            # No part of the arm is farther along than each joint's reach times its angle.
-            farthest = float((robot.reach * np.maximum(-robot.lower, robot.upper)).sum())
-            low, high = space.low.copy(), space.high.copy()
-            low[-3:], high[-3:] = -farthest, farthest
-            self.observation_space = Box(low, high, dtype=np.float64)
-            self._kinematics = robot.kinematics()
+            slip = _position_for_velocity(self.simulation.robot)
+            parts = self.simulation.observation.parts
+            self.simulation.observation = Observation(
+                [slip if part.name == slip.name else part for part in parts]
+            )
+            self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
 
     def set_episode_size(self, episode_size: int) -> None:
         """End episodes after so many steps, from this one on."""
         self._episode_size = whole_number("episode_size", episode_size)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start pose."""
-        observation, info = super().reset(seed=seed, options=options)
-        return self._as_original(observation), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move towards the joint targets (J,), rad, for one control period.
@@ -100,13 +93,21 @@ class GazeboMaraEnv(MaraEnv):
         truncated = truncated or statistics["ep_steps"] >= self._episode_size
         if terminated or truncated:
             info["infos"] = {name: v for name, v in statistics.items() if name != "ep_steps"}
-        return self._as_original(observation), reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
-    def _as_original(self, observation: Floats) -> Floats:
-        if self._slip:
-            q = observation[None, : self.simulation.robot.num_joints]
-            observation[-3:] = self._kinematics.velocity(q, q)[0]
-        return observation
+
+def _position_for_velocity(robot: RobotModel) -> Part:
+    """gym-gazebo2's part in place of the end effector's velocity: J(q)·q, the Jacobian times the joint positions."""
+    # No part of the arm is farther along than each joint's reach times its angle.
+    farthest = float((robot.reach * np.maximum(-robot.lower, robot.upper)).sum())
+    bound = np.full(3, farthest)
+    return Part(
+        "tool_velocity", -bound, bound, partial(_jacobian_times_position, robot.kinematics())
+    )
+
+
+def _jacobian_times_position(kinematics: Kinematics, state: SimState, goal: Goal) -> Floats:
+    return kinematics.velocity(state.q, state.q)
 
 
 for _name in PAPER_TASKS:

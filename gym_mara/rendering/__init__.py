@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from gym_mara.errors import MissingExtraError
 from gym_mara.rendering.settings import CAMERAS, RENDERERS, RenderSettings
+from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
-from gym_mara.state import View
 
 if TYPE_CHECKING:
     from gym_mara.rendering.renderer import Picture, Renderer
@@ -31,16 +31,16 @@ def make_renderer(robot: RobotModel, settings: RenderSettings, first: View) -> R
         MissingExtraError: the renderer, or every renderer, is not installed.
         NoDisplayError: the renderer that was chosen cannot draw on this machine.
     """
-    from gym_mara.rendering.look import look_at
+    from gym_mara.rendering.camera import place_camera
     from gym_mara.rendering.renderer import NoDisplayError
     from gym_mara.rendering.scene import Scene
 
     scene = Scene(robot)
-    look = look_at(scene, first, settings)
+    camera = place_camera(scene, first, settings)
     for name in RENDERERS:
         if settings.renderer in (None, name):
             try:
-                return _renderer_class(name)(scene, look, settings, first)
+                return _renderer_class(name)(scene, camera, settings, first)
             except (MissingExtraError, NoDisplayError):
                 if settings.renderer == name:
                     raise

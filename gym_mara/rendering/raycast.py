@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.extras import needs
-from gym_mara.rendering.look import (
+from gym_mara.rendering.camera import (
     AMBIENT,
     BACKGROUND,
     FILL,
@@ -17,13 +17,13 @@ from gym_mara.rendering.look import (
     SHINE,
     TO_LAMP,
     VIEW_ANGLE,
-    Look,
+    Camera,
     floor_colour,
 )
 from gym_mara.rendering.renderer import Picture, Renderer
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 with needs("the renderer 'raycast'", "render", "embreex"):
     from embreex.mesh_construction import TriangleMesh
@@ -69,11 +69,11 @@ class _Placed(NamedTuple):
 class RaycastRenderer(Renderer):
     """A ray through each pixel, and four through those at edges; one from there to the lamp."""
 
-    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
-        super().__init__(scene, look, settings, first)
-        forwards = look.at - look.eye
+    def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
+        super().__init__(scene, camera, settings, first)
+        forwards = camera.at - camera.eye
         forwards /= np.linalg.norm(forwards)
-        right = np.cross(forwards, look.up)
+        right = np.cross(forwards, camera.up)
         right /= np.linalg.norm(right)
         size = np.tan(np.radians(VIEW_ANGLE / 2.0)) / (self.height / 2.0)
         self._axes = np.array([size * right, size * np.cross(right, forwards), forwards])
@@ -124,12 +124,12 @@ class RaycastRenderer(Renderer):
 
     def _cast(self, rays: Singles, placed: _Placed) -> _Hits:
         """What rays (R, 3) from the eye hit, in the light that falls there."""
-        eye = self.look.eye.astype(np.float32)
+        eye = self.camera.eye.astype(np.float32)
         found = placed.scene.run(np.tile(eye, (len(rays), 1)), rays, query="INTERSECT", output=1)
         face, distance = found["primID"], found["tfar"]
         part = np.where(face >= 0, self._part_of_face[face], _NOTHING).astype(np.int32)
         with np.errstate(divide="ignore"):
-            to_floor = (self.look.floor[2] - eye[2]) / rays[:, 2]
+            to_floor = (self.camera.floor[2] - eye[2]) / rays[:, 2]
         part[(to_floor > 0.0) & (to_floor < distance)] = _FLOOR
         hits = _Hits(
             colour=np.tile(np.array(BACKGROUND, np.float32), (len(rays), 1)),
@@ -139,7 +139,9 @@ class RaycastRenderer(Renderer):
         )
         on_floor = np.flatnonzero(part == _FLOOR)
         points = eye + to_floor[on_floor, None] * rays[on_floor]
-        away = np.linalg.norm(points[:, :2] - self.look.floor[:2], axis=1) / self.look.floor_radius
+        away = (
+            np.linalg.norm(points[:, :2] - self.camera.floor[:2], axis=1) / self.camera.floor_radius
+        )
         hits.lit[on_floor] = self._is_lit(points, _UPWARDS, placed)
         shade = np.where(hits.lit[on_floor], 1.0, SHADE)
         hits.colour[on_floor] = floor_colour(away) * shade[:, None]

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
-from gym_mara.rendering.look import Look
+from gym_mara.rendering.camera import Camera
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 Picture = NDArray[np.uint8]
 """(height, width, 3), RGB."""
@@ -26,7 +26,7 @@ class Renderer(ABC):
 
     Args:
         scene: what there is to see.
-        look: from where.
+        camera: the camera.
         settings: the size of the pictures.
         first: a view, to see what stands where.
 
@@ -34,9 +34,9 @@ class Renderer(ABC):
         NoDisplayError: it cannot draw on this machine.
     """
 
-    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
+    def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
         self.scene = scene
-        self.look = look
+        self.camera = camera
         self.width, self.height = settings.width, settings.height
 
     @abstractmethod

@@ -10,8 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from gym_mara.extras import needs
+from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
-from gym_mara.state import View
 
 with needs("rendering", "render", "trimesh"):
     import trimesh

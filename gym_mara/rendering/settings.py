@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -52,18 +51,6 @@ class RenderSettings:
             object.__setattr__(self, "camera", _two_points(self.camera))
         elif self.camera not in CAMERAS:
             raise unknown("camera", self.camera, CAMERAS)
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """The keyword arguments."""
-        return tuple(field.name for field in fields(cls))
-
-    @classmethod
-    def split(cls, options: dict[str, Any]) -> tuple[RenderSettings, dict[str, Any]]:
-        """The settings among keyword arguments, and what else there is among them."""
-        names = cls.names()
-        chosen = {name: value for name, value in options.items() if name in names}
-        return cls(**chosen), {k: v for k, v in options.items() if k not in names}
 
 
 def _two_points(camera: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gym_mara.extras import needs
-from gym_mara.rendering.look import (
+from gym_mara.rendering.camera import (
     AMBIENT,
     BACKGROUND,
     FILL,
@@ -20,14 +20,14 @@ from gym_mara.rendering.look import (
     SHINE,
     TO_LAMP,
     VIEW_ANGLE,
-    Look,
+    Camera,
     floor_colour,
     shaded,
 )
 from gym_mara.rendering.renderer import NoDisplayError, Picture, Renderer
 from gym_mara.rendering.scene import Floats, Part, Scene
 from gym_mara.rendering.settings import RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 with needs("the renderer 'vtk'", "render", "pyvista"):
     import pyvista
@@ -66,8 +66,8 @@ class _Shadow(NamedTuple):
 class VtkRenderer(Renderer):
     """VTK's rasteriser, with shadows that are the parts themselves, flattened along the lamp's light."""
 
-    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
-        super().__init__(scene, look, settings, first)
+    def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
+        super().__init__(scene, camera, settings, first)
         if not _has_opengl():
             raise NoDisplayError(
                 "VTK finds no OpenGL to draw with: install EGL or OSMesa (Debian: libegl1 with libgl1-mesa-dri, "
@@ -80,7 +80,7 @@ class VtkRenderer(Renderer):
         self._plotter.render_window.SetMultiSamples(_SAMPLES)
         self._meshes = [_polydata(part) for part in scene.parts]
         self._actors = [self._add_part(*of) for of in zip(scene.parts, self._meshes, strict=True)]
-        towards = look.eye - look.at
+        towards = camera.eye - camera.at
         self._left_in_shadow = AMBIENT + FILL * max(0.0, towards[2] / np.linalg.norm(towards))
         self._shadows = self._add_shadows(scene.placements(first))
         self._add_floor()
@@ -103,7 +103,7 @@ class VtkRenderer(Renderer):
         parts = self.scene.parts
         boxes = [_box_around(part, m) for part, m in zip(parts, placements, strict=True)]
         # What shadows fall on: its height, and the number of the box.
-        receivers: list[tuple[float, int | None]] = [(float(self.look.floor[2]), None)]
+        receivers: list[tuple[float, int | None]] = [(float(self.camera.floor[2]), None)]
         for index, (part, placement) in enumerate(zip(parts, placements, strict=True)):
             if part.fixed and _fills(part, placement, boxes[index]):
                 receivers.append((float(boxes[index][1, 2]), index))
@@ -121,11 +121,11 @@ class VtkRenderer(Renderer):
 
     def _add_floor(self) -> None:
         """A disc that fades into the background."""
-        radius = self.look.floor_radius
+        radius = self.camera.floor_radius
         disc = pyvista.Disc(
-            center=self.look.floor, inner=0.0, outer=radius, normal=(0, 0, 1), r_res=24, c_res=64
+            center=self.camera.floor, inner=0.0, outer=radius, normal=(0, 0, 1), r_res=24, c_res=64
         )
-        away = np.linalg.norm(disc.points[:, :2] - self.look.floor[:2], axis=1)
+        away = np.linalg.norm(disc.points[:, :2] - self.camera.floor[:2], axis=1)
         disc["colour"] = np.uint8(255.0 * floor_colour(away / radius))
         self._plotter.add_mesh(disc, scalars="colour", rgb=True, lighting=False, render=False)
 
@@ -134,7 +134,11 @@ class VtkRenderer(Renderer):
         self._plotter.add_light(lamp)
         self._plotter.add_light(pyvista.Light(light_type="headlight", intensity=FILL))
         camera = self._plotter.camera
-        camera.position, camera.focal_point, camera.up = self.look.eye, self.look.at, self.look.up
+        camera.position, camera.focal_point, camera.up = (
+            self.camera.eye,
+            self.camera.at,
+            self.camera.up,
+        )
         camera.view_angle = VIEW_ANGLE
         self._plotter.renderer.ResetCameraClippingRange()
         self._plotter.renderer.camera_set = True

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium.spaces import Box
-from numpy.typing import NDArray
 
 from gym_mara import rotations
 from gym_mara.errors import GymMaraError, positive_number
-from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import miss, reachable_pose
 from gym_mara.state import SimState
-from gym_mara.tasks import rewards
-from gym_mara.tasks.base import Floats, Goal, Task
+from gym_mara.tasks import observation, rewards
+from gym_mara.tasks.base import Goal, Task, Workspace
+from gym_mara.tasks.observation import Part
+from gym_mara.types import Floats, Mask
+
+if TYPE_CHECKING:
+    from gym_mara.robot import RobotModel
 
 # Robot → target position (m), quaternion [w, x, y, z]; MARA's is gym-gazebo2's, the tool pointing straight down.
 _TARGETS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -70,41 +72,36 @@ class ReachTask(Task):
             or_zero = name in ("gamma", "delta", "eta")
             positive_number(name, getattr(self, name), or_zero=or_zero)
 
-    def goal(self, robot: RobotModel, num_envs: int) -> Goal:
-        """The target pose for each arm; warns where a target that was asked for is out of reach."""
+    def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
+        """The target pose of each arm; warns if a target that was asked for is out of reach."""
         asked = (self.target_position, self.target_quaternion)
         own: tuple[Any, Any] = (None, None)
         if None in asked:
-            own = _TARGETS.get(robot.name) or reachable_pose(robot)
+            own = _TARGETS.get(robot.name) or workspace.default_pose()
         position, quaternion = (
             np.array(mine if mine is not None else robots, dtype=np.float64)
             for mine, robots in zip(asked, own, strict=True)
         )
         quaternion = rotations.canonical(rotations.normalised(quaternion))
         if asked != (None, None):
-            _warn_if_out_of_reach(robot, position, quaternion if self.orientation else None)
+            _warn_if_out_of_reach(
+                robot, workspace, position, quaternion if self.orientation else None
+            )
         return Goal(np.tile(position, (num_envs, 1)), np.tile(quaternion, (num_envs, 1)))
 
-    def observation_space(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Box:
-        distance = robot.extent + np.linalg.norm(goal.position, axis=-1).max()
-        speed = (robot.reach * joint_velocity).sum()
-        high = [robot.upper, np.full(3, distance), np.full(3, speed)]
-        low = [robot.lower, np.full(3, -distance), np.full(3, -speed)]
-        if self.orientation:
-            one = 1.0 + 1e-9  # a unit quaternion is one but for rounding
-            high.insert(2, np.full(4, one))
-            low.insert(2, np.array([0.0, -one, -one, -one]))
-        return Box(np.concatenate(low), np.concatenate(high), dtype=np.float64)
+    def farthest(self, robot: RobotModel, goal: Goal) -> float:
+        """How far a target can be from the world's origin, m."""
+        return float(np.linalg.norm(goal.position, axis=-1).max())
 
-    def observe(self, state: SimState, goal: Goal) -> Floats:
-        """[q, position error (3) m, orientation error (4) if it counts, linear velocity (3) m/s] per arm.
-
-        The orientation error is q_ee ⊗ conj(q_target) as [w, x, y, z], w >= 0.
-        """
-        parts = [state.q, state.ee_position - goal.position, state.ee_velocity]
+    def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
+        """Joint positions, position error, orientation error if it counts, velocity of the end effector."""
+        parts = [
+            observation.joint_positions(robot),
+            observation.position_error(robot, self.farthest(robot, goal)),
+        ]
         if self.orientation:
-            parts.insert(2, goal.orientation_error(state.ee_quaternion))
-        return np.concatenate(parts, axis=-1)
+            parts.append(observation.orientation_error())
+        return [*parts, observation.tool_velocity(robot, joint_velocity)]
 
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
         """r_dist · r_orient - 1 - r_coll, and its terms.
@@ -116,7 +113,7 @@ class ReachTask(Task):
         return self.judge(state.ee_position, state.ee_quaternion, state.collided, goal)
 
     def judge(
-        self, position: Floats, quaternion: Floats, collided: NDArray[np.bool_], goal: Goal
+        self, position: Floats, quaternion: Floats, collided: Mask, goal: Goal
     ) -> tuple[Floats, dict[str, Floats]]:
         """The reward of tools at a position (N, 3), m, and a quaternion (N, 4), and its terms, as `reward` has them."""
         error = position - goal.position
@@ -142,8 +139,10 @@ class ReachTask(Task):
         }
 
 
-def _warn_if_out_of_reach(robot: RobotModel, position: Floats, quaternion: Floats | None) -> None:
-    distance, angle = miss(robot, position, quaternion)
+def _warn_if_out_of_reach(
+    robot: RobotModel, workspace: Workspace, position: Floats, quaternion: Floats | None
+) -> None:
+    distance, angle = workspace.shortfall(position, quaternion)
     if distance > _REACH_TOLERANCE[0] or angle > _REACH_TOLERANCE[1]:
         turn = f" and {np.degrees(angle):.1f}°" if quaternion is not None else ""
         warnings.warn(

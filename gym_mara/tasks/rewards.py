@@ -9,9 +9,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats, Mask
 
 # Constants are arrays here: a ufunc on one row takes a Python number at twice the cost.
 _ONE, _TWO = np.array(1.0), np.array(2.0)
@@ -53,9 +52,7 @@ def _bend(beta: float, gamma: float) -> tuple[Floats, Floats]:
     return np.array(beta), np.array(np.pi**-beta / (1.0 + gamma))
 
 
-def collision_penalty(
-    collided: NDArray[np.bool_], distance: Floats, delta: float, eta: float
-) -> Floats:
+def collision_penalty(collided: Mask, distance: Floats, delta: float, eta: float) -> Floats:
     """δ (2 min(d, 0.5))^η on a collision, else 0, of d (...,), m."""
     if not np.count_nonzero(collided):
         return np.zeros(np.shape(distance))

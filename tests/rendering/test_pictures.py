@@ -20,9 +20,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecVideoReco
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering import CAMERAS, RENDERERS
-from gym_mara.rendering.look import VIEW_ANGLE
+from gym_mara.rendering.camera import VIEW_ANGLE
 from gym_mara.testing import COLLIDING_Q, COPIES
 from tests.helpers import TARGET_Q
 
@@ -112,7 +113,7 @@ def test_only_links_that_collide_are_red() -> None:
     env = MaraEnv(render_mode="rgb_array")
     env.reset()
     env.step(np.array(COLLIDING_Q, np.float32))
-    touching = env.simulation.view(0).touching
+    touching = view_of(env.simulation, 0).touching
     assert "table" in touching
     assert "base_robot" not in touching
     assert 2 <= len(touching) < 8

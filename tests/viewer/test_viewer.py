@@ -15,8 +15,9 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from gym_mara.envs import MaraEnv
+from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError
-from gym_mara.rendering.look import VIEW_ANGLE
+from gym_mara.rendering.camera import VIEW_ANGLE
 from gym_mara.testing import COLLIDING_Q, pickled
 from tests.browser import chromium
 
@@ -233,21 +234,21 @@ def test_a_copy_has_no_viewer_until_it_is_reset() -> None:
 def test_what_collides_is_shown() -> None:
     loop = Loop(max_joint_velocity=None)
     loop.env.step(np.array(COLLIDING_Q, np.float32))
-    assert loop.env.simulation.view(0).touching
+    assert view_of(loop.env.simulation, 0).touching
     assert loop.env.render() is None
     loop.env.close()
 
 
-@pytest.mark.parametrize("what", ["_plot", "_stage.show"])
+@pytest.mark.parametrize("what", ["_panel.update", "_scene.show"])
 def test_a_sender_that_could_not_be_woken_does_not_stop_the_arm(
     monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    def fails(*_: Any) -> None:
+    def fails(*_: Any, **__: Any) -> None:
         raise RuntimeError(reason)
 
     loop = Loop()
-    owner = loop.viewer._stage if "." in what else loop.viewer
-    monkeypatch.setattr(owner, what.split(".")[-1], fails)
+    owner, method = what.split(".")
+    monkeypatch.setattr(getattr(loop.viewer, owner), method, fails)
     loop.viewer._drawn = loop.viewer._plotted = 0.0  # both are due
     reason = "deque mutated during iteration"
     loop.env.step(ACTION)

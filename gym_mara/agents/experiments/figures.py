@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from gym_mara.agents.experiments.grid import Grid, read_grid, read_result
-from gym_mara.agents.runs.evaluation import MAX_EPISODE_STEPS
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
 
 # Metric → where a result has it, and its digits.
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {

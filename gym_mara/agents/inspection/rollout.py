@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.agents.runs.evaluation import MAX_EPISODE_STEPS, make_env
+from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
+from gym_mara.tasks import MAX_EPISODE_STEPS
 
 Floats = NDArray[np.float64]
 

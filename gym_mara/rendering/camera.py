@@ -8,7 +8,7 @@ import numpy as np
 
 from gym_mara.rendering.scene import Colour, Floats, Scene
 from gym_mara.rendering.settings import CAMERAS, RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 VIEW_ANGLE = 30.0
 """Between the lower and the upper edge of a picture, deg."""
@@ -26,7 +26,7 @@ SHADE = 0.80
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Camera:
     """A camera, and the floor that it sees."""
 
     eye: Floats
@@ -41,7 +41,7 @@ class Look:
     """Where it has faded away, m."""
 
 
-def look_at(scene: Scene, view: View, settings: RenderSettings) -> Look:
+def place_camera(scene: Scene, view: View, settings: RenderSettings) -> Camera:
     """The look of a scene: a named camera sees all that moves, as it stands in this view."""
     lowest, highest = scene.bounds(view)
     middle, radius = 0.5 * (lowest + highest), 0.5 * float(np.linalg.norm(highest - lowest))
@@ -59,7 +59,7 @@ def look_at(scene: Scene, view: View, settings: RenderSettings) -> Look:
     forwards = (at - eye) / np.linalg.norm(at - eye)
     upright = abs(forwards[2]) < 0.98
     up = np.array([0.0, 0.0, 1.0]) if upright else np.array([1.0, 0.0, 0.0])
-    return Look(eye, at, up, floor, 6.0 * max(radius, 0.1))
+    return Camera(eye, at, up, floor, 6.0 * max(radius, 0.1))
 
 
 def floor_colour(away: Floats) -> Floats:

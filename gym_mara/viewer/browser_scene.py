@@ -8,22 +8,22 @@ import numpy as np
 import pinocchio as pin
 import viser
 
-from gym_mara.rendering.look import BACKGROUND, VIEW_ANGLE, Look
+from gym_mara.rendering.camera import BACKGROUND, VIEW_ANGLE, Camera
 from gym_mara.rendering.scene import Colour, Floats, Scene
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 
-class Stage:
-    """The parts of a scene as nodes of a viser server, a link's under one node; the target hangs on a handle to drag.
+class BrowserScene:
+    """The parts of a scene as nodes of a viser server, those of a link below one node; the target has a handle to drag.
 
     Args:
-        server: where they are shown.
+        server: the viser server that shows them.
         scene: what there is to see.
-        look: from where a browser sees it first.
-        view: how it stands at first.
+        camera: the camera that a browser begins with.
+        view: the first view.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, look: Look, view: View) -> None:
+    def __init__(self, server: viser.ViserServer, scene: Scene, camera: Camera, view: View) -> None:
         self._server, self._scene = server, scene
         server.scene.set_up_direction("+z")
         server.scene.configure_default_lights(cast_shadow=True)
@@ -32,14 +32,14 @@ class Stage:
             "/floor",
             width=4.0,
             height=4.0,
-            position=look.floor,
+            position=camera.floor,
             cell_color=(210, 214, 218),
             section_color=(190, 195, 200),
             shadow_opacity=0.2,
         )
-        camera = server.initial_camera
-        camera.position, camera.look_at = tuple(look.eye), tuple(look.at)
-        camera.fov = float(np.radians(VIEW_ANGLE))
+        initial = server.initial_camera
+        initial.position, initial.look_at = tuple(camera.eye), tuple(camera.at)
+        initial.fov = float(np.radians(VIEW_ANGLE))
         self.target = server.scene.add_transform_controls(
             "/target",
             scale=0.2,
@@ -52,7 +52,9 @@ class Stage:
         self._meshes: list[Any] = []
         placements = scene.placements(view)
         for index, part in enumerate(scene.parts):
-            if part.link not in self._leaders:  # the link's first part leads the others
+            if (
+                part.link not in self._leaders
+            ):  # the link's first part; the others are placed relative to it
                 self._leaders[part.link] = index
                 if part.link not in self._nodes:
                     node = server.scene.add_frame(f"/{part.link}", show_axes=False)
@@ -76,7 +78,7 @@ class Stage:
         self.show(view)
 
     def show(self, view: View) -> None:
-        """Move everything but the target, which the user's hand moves, to where it is in a view."""
+        """Move everything to where it is in a view, but the target, which the user moves."""
         placements = self._scene.placements(view)
         with self._server.atomic():
             for link, leader in self._leaders.items():
