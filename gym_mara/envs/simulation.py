@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
 from gym_mara.collision.coal import touching_links
+from gym_mara.collision.free_poses import FreePoses
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotLike, RobotModel
-from gym_mara.robot.inverse_kinematics import FreePoses
 from gym_mara.state import SimState, View
 from gym_mara.tasks import Goal, Task, make_task
 

@@ -1,18 +1,12 @@
-"""Which poses an arm can reach: how far off a pose is, and one that is certainly within reach."""
+"""Inverse kinematics: the configuration at which the end effector comes closest to a pose."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from gym_mara.collision import make_checker
-from gym_mara.collision.coal import CoalChecker
-from gym_mara.errors import GymMaraError
 from gym_mara.robot.model import RobotModel
-
-Floats = NDArray[np.float64]
-_TRIES = 10_000
+from gym_mara.types import Floats
 
 
 def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
@@ -75,52 +69,3 @@ def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tupl
     w, x, y, z = quaternion
     turn = pin.Quaternion(w, x, y, z).normalized().matrix() @ here.rotation.T
     return distance, float(np.linalg.norm(pin.log3(turn)))
-
-
-class FreePoses:
-    """Draws end-effector poses that the arm has at collision-free configurations.
-
-    Args:
-        robot: the arm.
-    """
-
-    def __init__(self, robot: RobotModel) -> None:
-        self._robot = robot
-        self._checker = CoalChecker(robot)
-        self._kinematics = robot.kinematics()
-        self._low = np.maximum(robot.lower, -np.pi)
-        self._high = np.minimum(robot.upper, np.pi)
-
-    def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """Position (3,), m, and quaternion (4,), [w, x, y, z], at a configuration drawn evenly from all that are free.
-
-        Raises:
-            GymMaraError: nearly every configuration of the robot collides.
-        """
-        for _ in range(_TRIES):
-            q = generator.uniform(self._low, self._high)[None]
-            if not self._checker.check(q)[0]:
-                position, quaternion = self._kinematics.pose(q)
-                return position[0], quaternion[0]
-        raise GymMaraError(
-            f"{self._robot.name} collides at {_TRIES} random configurations of as many"
-        )
-
-
-def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
-    """The end-effector pose, position (3,) m and quaternion (4,), of a collision-free configuration.
-
-    Always the same for a robot: the first of a fixed sequence, in the middle of the joints' ranges, that moves the
-    tool away from home.
-    """
-    checker = make_checker("coal", robot)
-    kinematics = robot.kinematics()
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    rng = np.random.default_rng(0)
-    candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
-    candidates = np.vstack([candidates, robot.home])  # where all else collides
-    position, quaternion = kinematics.pose(candidates)
-    away = np.linalg.norm(position - position[-1], axis=1)
-    good = ~checker.check(candidates) & (away > 0.25 * away.max())
-    chosen = int(good.argmax()) if good.any() else len(candidates) - 1
-    return position[chosen], quaternion[chosen]

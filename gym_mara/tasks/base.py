@@ -12,9 +12,9 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara import rotations
+from gym_mara.collision.free_poses import FreePoses
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import FreePoses
 from gym_mara.state import SimState
 
 Floats = NDArray[np.float64]

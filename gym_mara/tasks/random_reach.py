@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from gymnasium.spaces import Box
 
+from gym_mara.collision.free_poses import FreePoses
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import FreePoses
 from gym_mara.state import SimState
 from gym_mara.tasks.base import Floats, Goal
 from gym_mara.tasks.reach import ReachTask

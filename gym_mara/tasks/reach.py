@@ -11,9 +11,10 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara import rotations
+from gym_mara.collision.free_poses import reachable_pose
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import miss, reachable_pose
+from gym_mara.robot.inverse_kinematics import miss
 from gym_mara.state import SimState
 from gym_mara.tasks import rewards
 from gym_mara.tasks.base import Floats, Goal, Task

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gym_mara.collision import make_checker
-from gym_mara.robot.catalog import robot_names
-from gym_mara.robot.inverse_kinematics import miss, reachable_pose, solve_ik
+from gym_mara.robot.inverse_kinematics import miss, solve_ik
 from gym_mara.rotations import angle_between
 from gym_mara.testing import uniform_q
 from tests.helpers import robot_model
@@ -51,21 +50,6 @@ def test_a_pose_within_reach_in_position_only_is_missed_in_angle() -> None:
     assert miss(mara, highest, quaternion) == pytest.approx((0.0, 0.0), abs=1e-6)
     distance, angle = miss(mara, highest, upside_down)
     assert distance > 1e-3 or angle > 1e-2
-
-
-@pytest.mark.parametrize("name", robot_names())
-def test_the_own_target_of_a_robot_is_reachable_free_and_always_the_same(name: str) -> None:
-    robot = robot_model(name)
-    position, quaternion = reachable_pose(robot)
-    again = reachable_pose(robot)
-    np.testing.assert_array_equal(position, again[0])
-    np.testing.assert_array_equal(quaternion, again[1])
-    away = np.linalg.norm(position - robot.kinematics().pose(robot.home[None])[0][0])
-    assert away > 0.05, "a task whose target is the start is none"
-    q = solve_ik(robot, position, quaternion)
-    (there,), (turned,) = robot.kinematics().pose(q[None])
-    np.testing.assert_allclose(there, position, rtol=0.0, atol=1e-3)
-    assert angle_between(turned, quaternion) < 1e-2
 
 
 def test_the_target_of_mara_is_reached_without_collision() -> None:
