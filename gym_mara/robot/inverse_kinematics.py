@@ -34,7 +34,7 @@ def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> 
         position: of the end-effector frame in the world (3,), m.
         quaternion: its orientation [w, x, y, z]; None if any orientation will do.
     """
-    # SciPy takes longer to import than all else of an environment, and few environments need it.
+    # Imported here because that takes a third of a second, and few environments need it.
     from scipy.optimize import least_squares
 
     error = _PoseError(robot, position, quaternion)
