@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from gym_mara.agents.algorithms.presets import PRESETS
+from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.experiments import grid as benchmark
 from gym_mara.agents.experiments.figures import format_interval, interquartile_mean, plot_grid
 from gym_mara.agents.experiments.grid import Grid, open_grid, read_result, run_grid
@@ -159,8 +159,9 @@ def test_the_folder_of_another_grid_is_refused(
 ) -> None:
     with pytest.raises(GymMaraError, match=r"another grid .*steps 4096 there, 8192 now"):
         open_grid(finished_grid, replace(GRID, steps=8192))
-    changed = {"ppo": PRESETS["paper"]["ppo"], "acktr": PRESETS["tuned"]["acktr"]}
-    monkeypatch.setitem(PRESETS, "tuned", changed)
+    ppo = algorithm("ppo")
+    changed = replace(ppo, presets={"tuned": ppo.presets["paper"]})
+    monkeypatch.setitem(ALGORITHMS, "ppo", changed)
     with pytest.raises(GymMaraError, match="made with other 'tuned' presets"):
         open_grid(finished_grid, GRID)
     (tmp_path / "something").touch()
