@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Player, Trajectory, record
+from gym_mara.agents.inspection.rollout import Player, Trajectory, roll_out
 from gym_mara.agents.inspection.transfer import settled_after
 from gym_mara.agents.inspection.watch import film_run
 from gym_mara.agents.runs.evaluation import options_on
@@ -102,7 +102,7 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
     for backend, colour in zip(backends, _COLOURS, strict=False):
         with _open(run, backend, which) as player:
             robot, target = player.env.simulation.robot, player.env.simulation.goal.position[0]
-            episodes.append(_Episode(backend, record(player), colour))
+            episodes.append(_Episode(backend, roll_out(player), colour))
     sections = [
         ("The policy", _table(episodes) + "".join(f"<p>{html.escape(m)}</p>" for m in missing)),
         ("Video", _video(run, backends, which)),
