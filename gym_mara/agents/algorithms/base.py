@@ -96,9 +96,7 @@ class Algorithm:
     """An on-policy algorithm in the form of Stable-Baselines3."""
 
     name: str
-    """As in `--algo`."""
-    title: str
-    """As in figures and tables."""
+    """Its name in `--algo`; figures and tables print it in capitals."""
     summary: str
     """What it is, in a few words, for `gym-mara list`."""
     target: str

@@ -40,7 +40,6 @@ from tests.agents.conftest import silent
 
 A2C_ENTRY = Algorithm(
     name="a2c",
-    title="A2C",
     summary="advantage actor-critic, from Stable-Baselines3",
     target="stable_baselines3:A2C",
     presets={
@@ -70,7 +69,6 @@ def a2c(monkeypatch: pytest.MonkeyPatch) -> Algorithm:
 def test_an_entry_is_complete(name: str) -> None:
     entry = algorithm(name)
     assert entry.name == name
-    assert entry.title
     assert entry.summary
     assert DEFAULT_PRESET in entry.presets
     assert issubclass(entry.load_class(), OnPolicyAlgorithm)

@@ -195,6 +195,7 @@ def test_figures_and_tables_show_every_run(finished_grid: Path, tmp_path: Path) 
     assert {file.name for file in files} == {
         "MARA-v0.png",
         "MARA-v0_acktr.png",
+        "MARA-v0_ppo.png",
         "curves.csv",
         "table.csv",
         "table.md",
@@ -211,7 +212,7 @@ def test_a_finished_run_that_is_damaged_later_is_named(finished_grid: Path, tmp_
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
-    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it anew"):
+    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it again"):
         plot_grid(folder)
 
 
@@ -222,7 +223,7 @@ def test_what_has_not_finished_is_left_out_of_the_figures(
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_acktr_0" / "result.json").unlink()
     files = {file.name for file in plot_grid(folder)}
-    assert files == {"MARA-v0.png", "curves.csv", "table.csv", "table.md"}
+    assert files == {"MARA-v0.png", "MARA-v0_ppo.png", "curves.csv", "table.csv", "table.md"}
 
 
 def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:

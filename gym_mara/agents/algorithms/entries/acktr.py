@@ -44,7 +44,6 @@ _PAPER = Preset(
 
 ALGORITHM = Algorithm(
     name="acktr",
-    title="ACKTR",
     summary="actor-critic using Kronecker-factored trust region, our own",
     target="gym_mara.agents.algorithms.acktr:ACKTR",
     presets={

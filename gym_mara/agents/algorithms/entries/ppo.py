@@ -63,7 +63,6 @@ _PAPER = Preset(
 
 ALGORITHM = Algorithm(
     name="ppo",
-    title="PPO",
     summary="proximal policy optimisation, from Stable-Baselines3",
     target="stable_baselines3:PPO",
     presets={

@@ -62,7 +62,6 @@ _PAPER = Preset(
 
 ALGORITHM = Algorithm(
     name="trpo",
-    title="TRPO",
     summary="trust region policy optimisation, from sb3-contrib",
     target="sb3_contrib:TRPO",
     presets={
