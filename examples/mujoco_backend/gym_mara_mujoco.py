@@ -1,4 +1,4 @@
-"""The backend "mujoco": MuJoCo integrates the arms' motion, with position servos on the joints and contact."""
+"""The backend "mujoco": MuJoCo simulates the arms, with position servos on the joints and contact."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) < (3, 3):
 
 Floats = NDArray[np.float64]
 
-# All that the next step depends on, also where the solver starts from.
+# Everything that the next step depends on, including the start values of the solver.
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-# How hard a motor is, from 0 to 1: MuJoCo allows no more.
+# The largest stiffness of a motor that MuJoCo allows, from 0 to 1.
 _HARD = mujoco.mjMAXIMP
 
 
 class MujocoBackend(Backend):
-    """Full dynamics: gravity, inertia, contact, and motors that are only so strong and so fast.
+    """Full dynamics: gravity, inertia, contact, and motors of limited torque and speed.
 
-    Each joint has a position servo: its motor is commanded the velocity clip(gain · (target - q), ± the URDF's velocity
-    limit) at every physics step, and exerts what torque that takes up to the URDF's effort limit.
+    Each joint has a position servo. At every physics step its motor is commanded the velocity clip(gain · (target - q), ±
+    the velocity limit of the URDF), and applies the torque that this needs, up to the effort limit of the URDF.
 
-    MuJoCo takes meshes for their convex hulls, and what touches pushes. Where it has a contact, Coal says whether it
-    counts as a collision: so `collided` is the same at equal q as in the other backends.
+    MuJoCo replaces meshes by their convex hulls, and these push each other apart. If MuJoCo has a contact, Coal decides
+    whether it is a collision. At equal q, `collided` is therefore the same as in the other backends.
 
     Args:
         robot: the arm.
-        num_envs: how many of it.
+        num_envs: number of arms.
         control_period: s.
-        physics_step: s; a whole number of them makes a control period.
-        max_joint_velocity: rad/s (m/s), where it is below the URDF's limits; None for those.
+        physics_step: s; it must divide the control period.
+        max_joint_velocity: a limit below those of the URDF, rad/s (m/s); None for those of the URDF.
         servo_gain: 1/s.
 
     Raises:
-        GymMaraError: a setting is out of its range, or MuJoCo does not take the robot.
+        GymMaraError: a setting is out of range, or MuJoCo cannot load the robot.
     """
 
-    # Python commands the motors at every physics step, and holds its lock meanwhile.
+    # Python commands the motors at every physics step, and holds its lock while it does.
     in_processes = True
 
     def __init__(
@@ -83,7 +83,7 @@ class MujocoBackend(Backend):
         self._kinematics = robot.kinematics()
         self._checker = make_checker("coal", robot)
         self._model = build_model(robot, self.physics_step)
-        # Of MuJoCo's constraints those of the joints' friction come first, those of the motors next.
+        # In MuJoCo's list of constraints, joint friction comes first, then the motors.
         first = np.count_nonzero(self._model.dof_frictionloss)
         self._motors = slice(first, first + robot.num_joints)
         self._arms = [mujoco.MjData(self._model) for _ in range(num_envs)]
@@ -92,7 +92,7 @@ class MujocoBackend(Backend):
         self.reset(np.tile(robot.home, (num_envs, 1)))
 
     def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
-        """Put the arms that the mask names, or all, at rest at q."""
+        """Put the arms of the mask, or all arms, at rest at q."""
         rows = np.ones(self.num_envs, np.bool_) if mask is None else mask
         for index in np.flatnonzero(rows).tolist():
             arm = self._arms[index]
@@ -103,7 +103,7 @@ class MujocoBackend(Backend):
             self._collided[index] = self._collides(arm)
 
     def step(self, q_target: Floats) -> SimState:
-        """Plan what velocities the servos command in this period, and run the arms, one after the other."""
+        """Plan the velocity commands of the servos for this period, and run the arms one after the other."""
         q = np.array([arm.qpos for arm in self._arms])
         path = servo_motion(q, q_target, self._gain, self.joint_velocity, self._times)
         velocities = np.diff(path, axis=0) / self.physics_step
@@ -112,13 +112,13 @@ class MujocoBackend(Backend):
         return self.state
 
     def _run(self, index: int, velocities: Floats) -> None:
-        """One physics step of an arm for each row of commanded joint velocities (K, J).
+        """Run one physics step of an arm for each row of commanded joint velocities (K, J).
 
-        An arm is always left between the two halves of a step: contacts and constraints are those of where it is.
+        An arm always stops between the two halves of a step, so that contacts and constraints match its position.
         """
         arm, collided = self._arms[index], False
         for velocity in velocities:
-            # The motors' friction, made for a shaft at rest, is told how its shaft turns; see `_add_joint`.
+            # The friction of the motors assumes a shaft at rest: write the shaft's velocity into it, see `_add_joint`.
             arm.efc_aref[self._motors] = (velocity - arm.qvel) / self.physics_step
             mujoco.mj_step2(self._model, arm)
             self._torque[index] = arm.efc_force[self._motors]
@@ -131,13 +131,13 @@ class MujocoBackend(Backend):
             )
 
     def _collides(self, arm: mujoco.MjData) -> bool:
-        """Whether links touch where the arm is; without a contact of their hulls they do not."""
+        """Whether links touch; without a contact of their hulls they do not."""
         return arm.ncon > 0 and bool(self._checker.check(arm.qpos[None])[0])
 
     @property
     def state(self) -> SimState:
-        """The state now."""
-        # MuJoCo's constraints are soft: they let a joint slip past its limits by a little.
+        """The current state."""
+        # MuJoCo's constraints are soft: a joint can exceed its limits slightly.
         q = np.clip([arm.qpos for arm in self._arms], self.robot.lower, self.robot.upper)
         qd = np.clip([a.qvel for a in self._arms], -self.joint_velocity, self.joint_velocity)
         position, quaternion = self._kinematics.pose(q)
@@ -152,11 +152,11 @@ class MujocoBackend(Backend):
         )
 
     def report(self) -> dict[str, NDArray[Any]]:
-        """What the motors exerted in the last physics step (N, J), Nm."""
+        """Torques of the motors in the last physics step (N, J), Nm."""
         return {"joint_torque": self._torque.copy()}
 
     def save(self) -> dict[str, Any]:
-        """MuJoCo's state of every arm (N, S), and what it does not tell."""
+        """MuJoCo's state of every arm (N, S), and the values that it does not include."""
         states = np.empty((self.num_envs, mujoco.mj_stateSize(self._model, _STATE)))
         for arm, state in zip(self._arms, states, strict=True):
             mujoco.mj_getState(self._model, arm, state, _STATE)
@@ -167,7 +167,7 @@ class MujocoBackend(Backend):
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot; what follows from a state is computed anew."""
+        """Go back to a snapshot; values that follow from the state are computed again."""
         if snapshot["torque"].shape != self._torque.shape:
             raise GymMaraError(
                 f"the snapshot is of arms {snapshot['torque'].shape}; these are {self._torque.shape}"
@@ -190,16 +190,16 @@ def _restored(
 
 
 def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
-    """MuJoCo's model of a robot: a body for each joint, a motor on each joint, and the pairs that may collide.
+    """Build MuJoCo's model of a robot: a body and a motor for each joint, and the pairs that may collide.
 
     Raises:
-        GymMaraError: MuJoCo does not take it.
+        GymMaraError: MuJoCo cannot load the robot.
     """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = physics_step
     spec.option.gravity = robot.model.gravity.linear
-    # An arm that the engine loses is to be told of, not put back behind our back.
+    # If the state of an arm diverges, raise an error; do not let MuJoCo reset the arm silently.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
     bodies = [spec.worldbody]
     for number in range(1, robot.model.njoints):
@@ -213,16 +213,17 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
         model = spec.compile()
     except ValueError as error:
         raise GymMaraError(f"MuJoCo does not take the robot {robot.name!r}: {error}") from error
-    # One number a joint here, in every version of MuJoCo; not so in MjSpec.
+    # Here there is one value per joint in every version of MuJoCo; in MjSpec there is not.
     model.dof_damping[:] = robot.model.damping
     return model
 
 
 def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
-    """Add a joint of Pinocchio's model, what it carries, and its motor; return the body.
+    """Add a joint of Pinocchio's model, its body and its motor; return the body.
 
-    A motor is a clutch between the joint and a shaft that turns as commanded, and slips beyond the effort limit:
-    friction on a tendon that only the joint pulls. So MuJoCo's solver finds its torque together with the contacts'.
+    A motor works like a clutch between the joint and a shaft that turns at the commanded velocity; it slips above the effort
+    limit. It is modelled as friction on a tendon that is attached only to this joint. MuJoCo's solver therefore computes the
+    torque together with the contact forces.
     """
     name, inertia = robot.model.names[number], robot.model.inertias[number]
     body = parent.add_body(
@@ -243,7 +244,7 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
         frictionloss=robot.model.friction[number - 1],
     )
     motor = spec.add_tendon(
-        # MuJoCo has no constraint for a motor without any strength.
+        # MuJoCo has no constraint for a motor with an effort limit of zero.
         frictionloss=max(robot.effort_limit[number - 1], mujoco.mjMINVAL),
         solimp_friction=(_HARD, _HARD, 1.0, 0.5, 1.0),
     )
@@ -252,7 +253,7 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
 
 
 def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
-    """Add one of Pinocchio's geometry objects; it touches only what a pair says."""
+    """Add one of Pinocchio's geometry objects; it collides only with the shapes of its pairs."""
     geometry, kinds = shape.geometry, mujoco.mjtGeom
     name = type(geometry).__name__
     options: dict[str, Any]
@@ -267,7 +268,7 @@ def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
         spec.add_mesh(
             name=shape.name,
             uservert=geometry.vertices().ravel(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # of no account, but must be one
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # has no effect, but must be set
         )
         options = {"type": kinds.mjGEOM_MESH, "meshname": shape.name}
     else:
@@ -276,6 +277,6 @@ def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:
-    """A placement in MuJoCo's words: position, and quaternion [w, x, y, z]."""
+    """A placement as MuJoCo's arguments: position, and quaternion [w, x, y, z]."""
     *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
     return {"pos": position, "quat": [w, x, y, z]}
