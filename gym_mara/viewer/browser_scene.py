@@ -9,8 +9,9 @@ import pinocchio as pin
 import viser
 
 from gym_mara.rendering.camera import BACKGROUND, VIEW_ANGLE, Camera
-from gym_mara.rendering.scene import Colour, Floats, Scene
+from gym_mara.rendering.scene import Colour, Scene
 from gym_mara.rendering.view import View
+from gym_mara.types import Floats
 
 
 class BrowserScene:
