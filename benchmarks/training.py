@@ -8,7 +8,7 @@ from dataclasses import replace
 from idle_vec_env import IdleVecEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from gym_mara.agents.algorithms import presets
+from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent
 
@@ -18,7 +18,7 @@ SLICES = 5
 
 def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
     """Train both for 1M steps with PPO's preset of this name, slice by slice in turn, and say how the times compare."""
-    preset = presets.preset("ppo", name, teleports=True)
+    preset = algorithm("ppo").preset(name, teleports=True)
     ours = make_env(task, "pinocchio", preset.num_envs, {})
     models = [new_agent("ppo", preset, env, seed=0) for env in (ours, IdleVecEnv(ours))]
     seconds = [0.0, 0.0]
@@ -40,8 +40,8 @@ def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
 def update_costs(batch: int = 2048) -> dict[str, float]:
     """How long each algorithm's update takes on a batch of the same size, ms: the shortest of several turns."""
     models = {}
-    for algo in ("ppo", "trpo", "acktr"):
-        preset = presets.preset(algo, teleports=True)
+    for algo in ALGORITHMS:
+        preset = algorithm(algo).preset("tuned", teleports=True)
         steps = batch // preset.num_envs
         preset = replace(preset, arguments={**preset.arguments, "n_steps": steps})
         env = make_env("MARACollisionOrient-v0", "pinocchio", preset.num_envs, {})

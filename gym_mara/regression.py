@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
@@ -59,7 +60,10 @@ class Moved:
 
 
 def record(
-    env: str, backend: str = "pinocchio", options: dict[str, Any] | None = None, states: int = 256
+    env: str,
+    backend: str = DEFAULT_BACKEND,
+    options: dict[str, Any] | None = None,
+    states: int = 256,
 ) -> Record:
     """Compute the rewards of an environment at a set of states.
 

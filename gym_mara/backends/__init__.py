@@ -12,7 +12,9 @@ from gym_mara.backends.workers import WorkerBackend, choose_workers
 from gym_mara.errors import unknown
 from gym_mara.robot import RobotModel
 
-__all__ = ["Backend", "backend_names", "backend_settings", "make_backend"]
+__all__ = ["DEFAULT_BACKEND", "Backend", "backend_names", "backend_settings", "make_backend"]
+
+DEFAULT_BACKEND = "pinocchio"
 
 # Imported when first used: "module:class".
 _BACKENDS = {

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
     SetOption,
@@ -56,7 +57,7 @@ def watch(
         # Who jogs the arm into the table wants to see it there, and not back at home.
         keywords = {"on_collision": "continue", **options}
         with interruptible("Closed."):
-            open_viewer(task_name(env), backend or "pinocchio", keywords, speed=speed)
+            open_viewer(task_name(env), backend or DEFAULT_BACKEND, keywords, speed=speed)
         return
     with needs_agents():
         from gym_mara.agents.inspection.watch import film_run, watch_run
