@@ -19,6 +19,7 @@ from gym_mara.agents.inspection.watch import film_run
 from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder, read_progress, write_atomically
 from gym_mara.backends import backend_names
+from gym_mara.backends.registry import BrokenBackendError
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
@@ -96,7 +97,7 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
         try:
             _open(run, name, which).env.close()
             backends.append(name)
-        except MissingExtraError as error:
+        except (BrokenBackendError, MissingExtraError) as error:
             missing.append(str(error))
     episodes = []
     for backend, colour in zip(backends, _COLOURS, strict=False):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gym_mara.agents.inspection.rollout import Player, record
 from gym_mara.agents.runs.evaluation import options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.backends import backend_names, backend_settings
+from gym_mara.backends.registry import all_backend_settings
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 
@@ -57,7 +57,7 @@ def transfer(
     if episodes < 1:
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
     of_env, given = options_beyond_backend(run.config), options or {}
-    settings = {name: backend_settings(name) for name in backend_names()}
+    settings = all_backend_settings()
     if lost := set(given).difference(*settings.values()):
         raise GymMaraError(f"no backend knows the setting {min(lost)!r}")
     rows = []
