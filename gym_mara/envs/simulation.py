@@ -84,7 +84,7 @@ class Simulation:
         self._started = False
         self._closed = False
         # What the last step's observations are of; and the arms that have begun an episode since.
-        self._seen: tuple[SimState, dict[str, NDArray[Any]]] | None = None
+        self._seen: SimState | None = None
         self._began = np.zeros(self.num_envs, np.bool_)
         self.statistics = EpisodeStatistics(self.num_envs)
         self._kinematics = self.robot.kinematics()
@@ -136,8 +136,7 @@ class Simulation:
         if not self._started:
             raise ResetNeeded("call reset() before the first step()")
         state = self.backend.step(self._target(action))
-        report = self.backend.report()
-        self._seen = state, report
+        self._seen = state
         self._began.fill(False)
         observation = self._observe(state)
         reward, info = self.task.reward(state, self.goal)
@@ -149,20 +148,18 @@ class Simulation:
             self.backend.reset(self._start, None if count == self.num_envs else collided)
         distance = info["distance"] if "distance" in info else np.full(self.num_envs, np.nan)
         self.statistics.add(distance, reward, collided)
-        everything = {**info, "collided": collided, **report}
-        return Outcome(observation, reward, terminated, self.backend.diverged, everything)
+        diverged = None if state.diverged is None or not state.diverged.any() else state.diverged
+        everything = {**info, "collided": collided, **report(state)}
+        return Outcome(observation, reward, terminated, diverged, everything)
 
     def view(self, arm: int) -> View:
         """How an arm looks in its last observation: where it collided and was put back, it still collides there."""
         self._check_open()
-        if self._seen is None or self._began[arm]:
-            state, report = self.backend.state, self.backend.report()
-        else:
-            state, report = self._seen
+        state = self.backend.state if self._seen is None or self._began[arm] else self._seen
         touching: frozenset[str] = frozenset()
         if state.collided[arm]:
-            contacts = report["contacts"][arm] if "contacts" in report else ()
-            links = frozenset(link for contact in contacts for link in contact["links"])
+            contacts = () if state.contacts is None else state.contacts[arm]
+            links = frozenset(link for contact in contacts for link in contact.links)
             touching = links or touching_links(self.robot, state.q[arm])
         return View(state.q[arm], self.goal.position[arm], self.goal.quaternion[arm], touching)
 
@@ -195,7 +192,7 @@ class Simulation:
 
     def _observe(self, state: SimState, chosen: Mask | None = None) -> Floats:
         """What the task shows of the states, as the sensors of the arms, or of those chosen, see them."""
-        noise = self.backend.sensor_noise
+        noise = (state.parameters or {}).get("sensor_noise")
         if noise is not None:
             q = state.q.copy()
             for index, generator in self._noise.items():
@@ -252,3 +249,15 @@ class Simulation:
         if not self._closed:
             self._closed = True
             self.backend.close()
+
+
+def report(state: SimState) -> dict[str, NDArray[Any]]:
+    """What `info` says of the arms beyond the task's terms, each (N, …)."""
+    values: dict[str, NDArray[Any]] = {}
+    if state.torque is not None:
+        values["joint_torque"] = state.torque
+    if state.contacts is not None:
+        values["contacts"] = np.empty(len(state.contacts), dtype=object)
+        for arm, contacts in enumerate(state.contacts):
+            values["contacts"][arm] = [contact._asdict() for contact in contacts]
+    return values | dict(state.parameters or {})

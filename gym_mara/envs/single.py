@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.envs.simulation import Simulation
+from gym_mara.envs.simulation import Simulation, report
 from gym_mara.errors import unknown
 from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.robot import RobotLike
@@ -72,7 +72,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         observation = self.simulation.reset((self.np_random,))[0]
         if self.render_mode == "human":
             self._show()
-        return observation, _info_of_one(self.simulation.backend.report())
+        return observation, _info_of_one(report(self.simulation.backend.state))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move towards the joint targets (J,), rad, for one control period.

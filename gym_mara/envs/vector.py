@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.envs.simulation import Mask, Simulation
+from gym_mara.envs.simulation import Mask, Simulation, report
 from gym_mara.envs.single import checked_render_mode
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.rendering import Pictures, RenderSettings
@@ -103,7 +103,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         if self.simulation.random:
             self._seed(seeds, chosen)
         observation = self.simulation.reset(self._generators, mask)
-        return observation, _vector_info(self.simulation.backend.report(), chosen)
+        return observation, _vector_info(report(self.simulation.backend.state), chosen)
 
     def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
         """Give each arm a random generator of its own, the one that a MaraEnv has with the arm's seed."""
@@ -168,7 +168,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     def _report_beginning(self, info: dict[str, Any], began: Mask) -> None:
         """Enter what the backend says of arms whose episodes have just begun."""
-        for key, values in self.simulation.backend.report().items():
+        for key, values in report(self.simulation.backend.state).items():
             info[key][began] = values[began]
             info[f"_{key}"][began] = True
 
