@@ -17,7 +17,7 @@ from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.rotations import canonical, conjugate, multiply
 from gym_mara.state import SimState
 from gym_mara.tasks import PAPER_TASKS, TASKS, ReachTask, Task, make_task
-from gym_mara.testing import arrays_of, uniform_q
+from gym_mara.testing import arms_of, arrays_of, uniform_q
 from tests.helpers import (
     TARGET_Q,
     TASK_NAMES,
@@ -48,7 +48,7 @@ def _state(robot: RobotModel, q: Floats, seed: int | None = None) -> SimState:
 
 
 def _row(state: SimState, row: int) -> SimState:
-    return SimState(**{name: array[row : row + 1] for name, array in arrays_of(state).items()})
+    return arms_of(state, slice(row, row + 1))
 
 
 def test_the_four_tasks_are_four_values_of_one_class() -> None:
