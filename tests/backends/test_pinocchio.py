@@ -170,10 +170,10 @@ def test_without_a_checker_nothing_collides() -> None:
 
 
 @pytest.mark.parametrize("name", ["mara", "ur5", "panda"])
-def test_to_look_for_room_around_a_path_changes_no_answer(name: str) -> None:
+def test_checking_paths_with_a_margin_changes_no_answer(name: str) -> None:
     robot, rng = robot_model(name), np.random.default_rng(0)
     backend, sampling = (PinocchioBackend(robot, 32, max_joint_velocity=1.57) for _ in range(2))
-    sampling._with_room = None
+    sampling._with_margin = None
     counts = [_count_checks(each) for each in (backend, sampling)]
     hits = 0
     for period in range(60):

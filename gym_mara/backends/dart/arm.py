@@ -15,6 +15,7 @@ from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
+from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -125,7 +126,7 @@ class DartArm:
                     _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
                 body.setName(link)
                 links[link] = body
-            node = links[link].createShapeNode(_shape(geometry_object))
+            node = links[link].createShapeNode(_shape(self.robot, index))
             node.createCollisionAspect()
             node.createDynamicsAspect()
             node.setRelativeTransform(_isometry(geometry_object.placement))
@@ -283,22 +284,21 @@ def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
     body.setInertia(dart.dynamics.Inertia(inertia.mass, inertia.lever, inertia.inertia))
 
 
-def _shape(geometry_object: pin.GeometryObject) -> Any:
-    """DART's shape of one of Pinocchio's geometry objects."""
-    shape = geometry_object.geometry
-    kind = type(shape).__name__
-    if kind == "Box":
-        return dart.dynamics.BoxShape(2.0 * shape.halfSide)
-    if kind == "Cylinder":
-        return dart.dynamics.CylinderShape(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Capsule":
-        return dart.dynamics.CapsuleShape(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Sphere":
-        return dart.dynamics.SphereShape(shape.radius)
-    if kind.startswith("BVHModel"):
-        return _mesh(geometry_object.meshPath, geometry_object.meshScale)
+def _shape(robot: RobotModel, index: int) -> Any:
+    """DART's shape of one of the robot's collision shapes."""
+    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
+        case Box(size):
+            return dart.dynamics.BoxShape(size)
+        case Sphere(radius):
+            return dart.dynamics.SphereShape(radius)
+        case Cylinder(radius, length):
+            return dart.dynamics.CylinderShape(radius, length)
+        case Capsule(radius, length):
+            return dart.dynamics.CapsuleShape(radius, length)
+        case Mesh(path, scale, convex=False):
+            return _mesh(path, scale)
     raise GymMaraError(
-        f"the backend 'dart' does not know the shape {kind} of {geometry_object.name!r}"
+        f"the backend 'dart' does not support the convex hull of link {robot.link_of(index)!r}"
     )
 
 
