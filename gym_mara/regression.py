@@ -1,8 +1,8 @@
-"""Reward regression: record a task's rewards over a fixed set of states, and find what moved since.
+"""Reward regression: record a task's rewards in a fixed set of states, and find those that have changed since.
 
-A record is a CSV file. Its first line, a comment, says what was recorded; then comes a row per state: the configuration
-that the arm is put at, the terms of the reward, and the reward. The states are read from the record, so that a check
-depends on nothing but the code under test.
+A record is a CSV file. Its first line is a comment that says what was recorded. Then there is a row for each state: the
+joint positions, the terms of the reward, and the reward. A check reads the states from the record, so it depends on
+nothing but the code under test.
 """
 
 from __future__ import annotations
@@ -15,22 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.inverse_kinematics import solve_ik
-
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats
 
 _HEADER = "# gym_mara reward record: "
 
 
 @dataclass(frozen=True)
 class Record:
-    """The rewards of one environment on one backend over S states."""
+    """The rewards of one environment on one backend in S states."""
 
     env: str
     backend: str
@@ -39,12 +37,12 @@ class Record:
     q: Floats
     """The configurations (S, J), rad."""
     values: dict[str, Floats]
-    """The terms of the reward, `collided` and `reward`, each (S,)."""
+    """The terms of the reward, `collided` and `reward`; each (S,)."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A value that is not what was recorded."""
+    """A value that has changed since it was recorded."""
 
     row: int
     """The state's number, from 0."""
@@ -65,29 +63,29 @@ def record(
     options: dict[str, Any] | None = None,
     states: int = 256,
 ) -> Record:
-    """Compute the rewards of an environment over a grid of states.
+    """Compute the rewards of an environment in a fixed set of states.
 
-    Half of the states fill the joints' ranges evenly (a Kronecker sequence); half lie on the way from the start to the
-    target, ever closer together, down to 0.1 mm and less before it: there the reward is steep.
+    Half of the states cover the joints' ranges evenly. The other half lie on a path from the start to the target; they become
+    denser towards the target, up to less than 0.1 mm from it, because the reward is steep there.
 
     Raises:
-        GymMaraError: a name is unknown, or there are less than two states.
+        GymMaraError: a name is unknown, or `states` is less than 2.
     """
     if states < 2:
         raise GymMaraError(f"states must be at least 2, not {states}")
     simulation = _simulation(env, backend, options or {}, 1)
     try:
-        q = _grid(simulation, states)
+        q = _sample_q(simulation, states)
     finally:
         simulation.close()
-    return evaluate(env, backend, options or {}, q)
+    return compute(env, backend, options or {}, q)
 
 
-def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
-    """Compute the rewards of an environment at configurations q (S, J), rad, where the arm rests.
+def compute(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
+    """Compute the rewards of an environment with the arm at rest at joint positions q (S, J), rad.
 
     Raises:
-        GymMaraError: a name is unknown, or the configurations do not fit the robot.
+        GymMaraError: a name is unknown, or the joint positions do not fit the robot.
     """
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
@@ -105,15 +103,15 @@ def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Reco
 
 
 def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Moved]:
-    """What differs by more than the tolerance, in the order of the states.
+    """The values that differ by more than the tolerance, in the order of the states.
 
     Raises:
-        GymMaraError: the two do not hold the same terms.
+        GymMaraError: the two records have different terms.
     """
     if recorded.values.keys() != now.values.keys():
         raise GymMaraError(
             f"the record holds {', '.join(recorded.values)}; the task now has {', '.join(now.values)}: "
-            "record anew if that is meant"
+            "if this is intended, make a new record"
         )
     moved = [
         Moved(row, name, float(old), float(new))
@@ -125,13 +123,13 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
 
 
 def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> list[Moved]:
-    """Compute a record anew, on its own backend or another, and return what moved.
+    """Compute the rewards of a record again, on its own backend or another one, and return the values that have changed.
 
     Raises:
-        GymMaraError: the file is missing or damaged, or the task's terms are others now.
+        GymMaraError: the file is missing or damaged, or the task's terms have changed.
     """
     recorded = read(file)
-    now = evaluate(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
+    now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
     return compare(recorded, now, tolerance)
 
 
@@ -139,7 +137,7 @@ def write(file: Path, recorded: Record) -> None:
     """Write a record to a new file.
 
     Raises:
-        GymMaraError: the file exists, or cannot be written; nothing is overwritten.
+        GymMaraError: the file exists already, or cannot be written.
     """
     about = {"env": recorded.env, "backend": recorded.backend, "options": recorded.options}
     text = io.StringIO()
@@ -169,7 +167,7 @@ def read(file: Path) -> Record:
     try:
         header, *lines = file.read_text().splitlines()
         if not header.startswith(_HEADER):
-            raise ValueError("it does not begin with the header of a record")
+            raise ValueError("it does not start with the header of a record")
         about = json.loads(header.removeprefix(_HEADER))
         names = lines[0].split(",")
         columns = np.array([[float(x) for x in line.split(",")] for line in lines[1:]]).T
@@ -189,17 +187,18 @@ def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) 
     return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
 
 
-def _grid(simulation: Simulation, states: int) -> Floats:
+def _sample_q(simulation: Simulation, states: int) -> Floats:
+    """Joint positions (states, J), rad, for a record; always the same ones."""
     robot, goal = simulation.robot, simulation.goal
-    # Kronecker sequence of the generalised golden ratio: even in any number of dimensions.
+    # A Kronecker sequence with powers of the generalised golden ratio covers any number of dimensions evenly.
     phi = 2.0
     for _ in range(64):
         phi = (1.0 + phi) ** (1.0 / (robot.num_joints + 1))
     steps = phi ** -np.arange(1.0, robot.num_joints + 1)
-    spread_out = states // 2
-    unit = (0.5 + np.outer(np.arange(1, spread_out + 1), steps)) % 1.0
+    num_even = states // 2
+    unit = (0.5 + np.outer(np.arange(1, num_even + 1), steps)) % 1.0
     even = simulation.target_low + unit * (simulation.target_high - simulation.target_low)
     at_target = solve_ik(robot, goal.position[0], goal.quaternion[0])
-    left = np.geomspace(1.0, 1e-4, states - spread_out)[:, None]
-    near = at_target + left * (robot.home - at_target)
+    remaining = np.geomspace(1.0, 1e-4, states - num_even)[:, None]
+    near = at_target + remaining * (robot.home - at_target)
     return np.vstack([even, near])

@@ -1,4 +1,4 @@
-"""Reward records: the project's own, and what guarding with them finds."""
+"""Reward records: those of the project still hold, and a check finds every change."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ RECORDS = Path(__file__).parent / "rewards"
 
 @pytest.mark.parametrize("backend", backend_names())
 @pytest.mark.parametrize("task", TASKS)
-def test_no_reward_has_moved(check_rewards: Callable[..., None], task: str, backend: str) -> None:
+def test_no_reward_has_changed(check_rewards: Callable[..., None], task: str, backend: str) -> None:
     check_rewards(RECORDS / f"{task}.csv", backend=backend)
 
 
-def test_a_record_reaches_from_afar_to_the_peak() -> None:
+def test_a_record_covers_states_far_from_the_target_and_close_to_it() -> None:
     recorded = regression.record("MARACollisionOrient-v0", states=64)
     assert recorded.values["distance"].max() > 0.5
     assert recorded.values["distance"].min() < 1e-3
@@ -31,7 +31,7 @@ def test_a_record_reaches_from_afar_to_the_peak() -> None:
     assert 0.1 < recorded.values["collided"].mean() < 0.9
 
 
-def test_a_record_comes_back_from_its_file_to_the_bit(tmp_path: Path) -> None:
+def test_a_record_is_written_and_read_without_loss(tmp_path: Path) -> None:
     recorded = regression.record("MARAOrient-v0", options={"kappa": 0.03}, states=16)
     regression.write(tmp_path / "record.csv", recorded)
     again = regression.read(tmp_path / "record.csv")
@@ -59,13 +59,13 @@ def test_a_changed_reward_is_found_row_by_row(
     assert regression.check(tmp_path / "record.csv", tolerance=0.1) == []
 
 
-def test_nan_counts_as_moved(tmp_path: Path) -> None:
+def test_nan_counts_as_a_change(tmp_path: Path) -> None:
     recorded = regression.record("MARA-v0", states=2)
     recorded.values["reward"][1] = np.nan
     assert [m.row for m in regression.compare(recorded, recorded)] == [1]
 
 
-def test_the_fixture_fails_with_the_rows(
+def test_the_fixture_lists_the_rows_that_changed(
     tmp_path: Path, check_rewards: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     regression.write(tmp_path / "record.csv", regression.record("MARA-v0", states=4))
@@ -97,26 +97,26 @@ def test_a_file_that_exists_is_not_overwritten(tmp_path: Path) -> None:
         "# gym_mara reward record: x",
     ],
 )
-def test_a_file_that_is_no_record_is_named(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_record_is_an_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "record.csv"
     file.write_text(text)
     with pytest.raises(GymMaraError, match="is no reward record"):
         regression.check(file)
 
 
-def test_a_missing_record_is_named(tmp_path: Path) -> None:
+def test_a_missing_record_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(GymMaraError, match="cannot read"):
         regression.check(tmp_path / "record.csv")
 
 
-def test_terms_that_were_renamed_are_named(tmp_path: Path) -> None:
+def test_a_record_with_other_terms_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "record.csv"
     regression.write(file, regression.record("MARA-v0", states=2))
     file.write_text(file.read_text().replace("angle_error", "angle"))
-    with pytest.raises(GymMaraError, match="record anew"):
+    with pytest.raises(GymMaraError, match="make a new record"):
         regression.check(file)
 
 
-def test_a_record_wants_two_states() -> None:
+def test_a_record_needs_two_states() -> None:
     with pytest.raises(GymMaraError, match="at least 2"):
         regression.record("MARA-v0", states=1)
