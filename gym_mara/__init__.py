@@ -1,4 +1,4 @@
-"""gym_mara: Gymnasium environments for the modular robot arm MARA. Importing it registers them."""
+"""gym_mara: Gymnasium environments for the modular robot arm MARA and other arms. Importing it registers them."""
 
 from gymnasium.envs.registration import register
 

@@ -1,8 +1,8 @@
-"""Reward regression: record a task's rewards in a fixed set of states, and find those that have changed since.
+"""Reward regression: record a task's rewards at a fixed set of states, and later find the values that have changed.
 
-A record is a CSV file. Its first line is a comment that says what was recorded. Then there is a row for each state: the
-joint positions, the terms of the reward, and the reward. A check reads the states from the record, so it depends on
-nothing but the code under test.
+A record is a CSV file. Its first line is a comment with the environment, the backend and the options. Then follows one
+row per state: the arm's configuration, the terms of the reward, and the reward. A check reads the states from the
+record, so that its result depends only on the code under test.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ _HEADER = "# gym_mara reward record: "
 
 @dataclass(frozen=True)
 class Record:
-    """The rewards of one environment on one backend in S states."""
+    """The rewards of one environment on one backend at S states."""
 
     env: str
     backend: str
     options: dict[str, Any]
-    """Keyword arguments of the environment besides the backend."""
+    """The keyword arguments of the environment, without the backend."""
     q: Floats
-    """The configurations (S, J), rad."""
+    """The configurations (S, J), rad (m for a prismatic joint)."""
     values: dict[str, Floats]
-    """The terms of the reward, `collided` and `reward`; each (S,)."""
+    """The terms of the reward, `collided` and `reward` by name, each (S,)."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A value that has changed since it was recorded."""
+    """A value that differs from its record."""
 
     row: int
-    """The state's number, from 0."""
+    """The index of the state, from 0."""
     name: str
     recorded: float
     now: float
@@ -63,13 +63,14 @@ def record(
     options: dict[str, Any] | None = None,
     states: int = 256,
 ) -> Record:
-    """Compute the rewards of an environment in a fixed set of states.
+    """Compute the rewards of an environment at a set of states.
 
-    Half of the states cover the joints' ranges evenly. The other half lie on a path from the start to the target; they become
-    denser towards the target, up to less than 0.1 mm from it, because the reward is steep there.
+    One half of the states is spread evenly over the joint ranges (a Kronecker sequence). The other half lies on the
+    straight line in joint space from the home configuration to the target. These states become denser towards the
+    target, where the reward is steep; the last one is about 0.1 mm or less away from it.
 
     Raises:
-        GymMaraError: a name is unknown, or `states` is less than 2.
+        GymMaraError: a name is unknown, or there are fewer than two states.
     """
     if states < 2:
         raise GymMaraError(f"states must be at least 2, not {states}")
@@ -82,10 +83,10 @@ def record(
 
 
 def compute(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
-    """Compute the rewards of an environment with the arm at rest at joint positions q (S, J), rad.
+    """Compute the rewards of an environment with the arm at rest at configurations q (S, J), rad.
 
     Raises:
-        GymMaraError: a name is unknown, or the joint positions do not fit the robot.
+        GymMaraError: a name is unknown, or a configuration has the wrong length or exceeds the joint limits.
     """
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
@@ -106,12 +107,12 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
     """The values that differ by more than the tolerance, in the order of the states.
 
     Raises:
-        GymMaraError: the two records have different terms.
+        GymMaraError: the two records do not have the same terms.
     """
     if recorded.values.keys() != now.values.keys():
         raise GymMaraError(
-            f"the record holds {', '.join(recorded.values)}; the task now has {', '.join(now.values)}: "
-            "if this is intended, make a new record"
+            f"the record has the terms {', '.join(recorded.values)}, but the task now has {', '.join(now.values)}: "
+            "if this is intended, delete the record and write a new one"
         )
     moved = [
         Moved(row, name, float(old), float(new))
@@ -123,10 +124,10 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
 
 
 def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> list[Moved]:
-    """Compute the rewards of a record again, on its own backend or another one, and return the values that have changed.
+    """Compute the rewards of a record again, on its backend or another, and return the values that have changed.
 
     Raises:
-        GymMaraError: the file is missing or damaged, or the task's terms have changed.
+        GymMaraError: the file is missing or damaged, or the task now has other terms.
     """
     recorded = read(file)
     now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
@@ -137,7 +138,7 @@ def write(file: Path, recorded: Record) -> None:
     """Write a record to a new file.
 
     Raises:
-        GymMaraError: the file exists already, or cannot be written.
+        GymMaraError: the file exists and is not overwritten, or it cannot be written.
     """
     about = {"env": recorded.env, "backend": recorded.backend, "options": recorded.options}
     text = io.StringIO()
@@ -167,7 +168,7 @@ def read(file: Path) -> Record:
     try:
         header, *lines = file.read_text().splitlines()
         if not header.startswith(_HEADER):
-            raise ValueError("it does not start with the header of a record")
+            raise ValueError("its first line is not the header of a record")
         about = json.loads(header.removeprefix(_HEADER))
         names = lines[0].split(",")
         columns = np.array([[float(x) for x in line.split(",")] for line in lines[1:]]).T
@@ -177,20 +178,20 @@ def read(file: Path) -> Record:
     except OSError as error:
         raise GymMaraError(f"cannot read {str(file)!r}: {error.strerror}") from error
     except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise GymMaraError(f"{str(file)!r} is no reward record: {error}") from error
+        raise GymMaraError(f"{str(file)!r} is not a reward record: {error}") from error
 
 
 def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
-    """N arms, with the keyword arguments that an environment takes."""
+    """A simulation of N arms, from the keyword arguments of an environment."""
     rest = {name: v for name, v in options.items() if name not in ("robot", "ee_frame")}
     robot, ee_frame = options.get("robot", "mara"), options.get("ee_frame")
     return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
 
 
 def _sample_q(simulation: Simulation, states: int) -> Floats:
-    """Joint positions (states, J), rad, for a record; always the same ones."""
+    """The configurations (S, J) of `record`, rad."""
     robot, goal = simulation.robot, simulation.goal
-    # A Kronecker sequence with powers of the generalised golden ratio covers any number of dimensions evenly.
+    # The Kronecker sequence of the generalised golden ratio is evenly spread in any number of dimensions.
     phi = 2.0
     for _ in range(64):
         phi = (1.0 + phi) ** (1.0 / (robot.num_joints + 1))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gym_mara.collision.free_poses import FreePoses, reachable_pose
 from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import FreePoses, miss, reachable_pose
+from gym_mara.robot.inverse_kinematics import miss
 from gym_mara.types import Floats
 
 

@@ -1,4 +1,4 @@
-"""How a scene is looked at and lit, whatever draws it: the camera, the lamp, the floor."""
+"""The camera, the lights and the floor of a scene, the same for every renderer."""
 
 from __future__ import annotations
 
@@ -6,43 +6,44 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gym_mara.rendering.scene import Colour, Floats, Scene
+from gym_mara.rendering.scene import Colour, Scene
 from gym_mara.rendering.settings import CAMERAS, RenderSettings
 from gym_mara.rendering.view import View
+from gym_mara.types import Floats
 
 VIEW_ANGLE = 30.0
-"""Between the lower and the upper edge of a picture, deg."""
+"""The vertical field of view, deg."""
 AMBIENT, KEY, FILL = 0.40, 0.50, 0.18
-"""How much light comes from everywhere, from the lamp, and from the camera."""
-SHINE = 0.12
-"""How much of the light surfaces reflect as a mirror would."""
-TO_LAMP: Floats = np.array([-0.25, -0.45, 1.0]) / np.linalg.norm([-0.25, -0.45, 1.0])
-"""Where the lamp is, a direction in the world frame."""
+"""Intensities of the ambient light, of the key light, and of the fill light at the camera."""
+SPECULAR = 0.12
+"""The specular coefficient of surfaces."""
+TO_KEY_LIGHT: Floats = np.array([-0.25, -0.45, 1.0]) / np.linalg.norm([-0.25, -0.45, 1.0])
+"""The unit vector towards the key light, in the world frame."""
 BACKGROUND: Colour = (0.94, 0.95, 0.96)
 FLOOR: Colour = (0.80, 0.82, 0.84)
-"""Where it is darkest, under the arm; it fades into the background."""
-SHADE = 0.80
-"""How bright the floor's shadow is, of the floor."""
+"""The colour at the middle of the floor, under the arm; the floor fades into the background."""
+SHADOW = 0.80
+"""The brightness of a shadow on the floor, relative to the floor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera, and the floor that it sees."""
+    """The pose of a camera, and the floor of its scene, in the world frame."""
 
     eye: Floats
-    """Where the camera is (3,), m, in the world frame."""
+    """The position of the camera (3,), m."""
     at: Floats
-    """What it looks at (3,), m."""
+    """The point that it looks at (3,), m."""
     up: Floats
-    """(3,)."""
+    """The upward direction of the picture (3,)."""
     floor: Floats
     """The middle of the floor (3,), m."""
     floor_radius: float
-    """Where it has faded away, m."""
+    """The distance from the middle at which the floor has faded into the background, m."""
 
 
 def place_camera(scene: Scene, view: View, settings: RenderSettings) -> Camera:
-    """The look of a scene: a named camera sees all that moves, as it stands in this view."""
+    """Place the camera and the floor. A named camera is placed so that it sees everything that moves in this view."""
     lowest, highest = scene.bounds(view)
     middle, radius = 0.5 * (lowest + highest), 0.5 * float(np.linalg.norm(highest - lowest))
     ground, _ = scene.bounds(view, moving=False)
@@ -62,13 +63,13 @@ def place_camera(scene: Scene, view: View, settings: RenderSettings) -> Camera:
     return Camera(eye, at, up, floor, 6.0 * max(radius, 0.1))
 
 
-def floor_colour(away: Floats) -> Floats:
-    """The floor's colour (..., 3), in [0, 1], so far (...) from its middle, 1 where it has faded away."""
-    faded = np.clip(away, 0.0, 1.0)[..., None] ** 0.7
-    return (1.0 - faded) * np.array(FLOOR) + faded * np.array(BACKGROUND)
+def floor_colour(distance: Floats) -> Floats:
+    """The floor's colour (..., 3), in [0, 1], at a distance (...) from its middle, relative to its radius."""
+    fade = np.clip(distance, 0.0, 1.0)[..., None] ** 0.7
+    return (1.0 - fade) * np.array(FLOOR) + fade * np.array(BACKGROUND)
 
 
 def shaded(colour: Colour, light: float) -> Colour:
-    """A colour in so much light."""
+    """A colour times a light intensity."""
     red, green, blue = (light * value for value in colour)
     return red, green, blue

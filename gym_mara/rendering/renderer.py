@@ -18,20 +18,20 @@ Picture = NDArray[np.uint8]
 
 
 class NoDisplayError(GymMaraError):
-    """A renderer is installed, but nothing here lets it draw."""
+    """A renderer is installed, but it finds no way to draw on this machine."""
 
 
 class Renderer(ABC):
-    """Draws the views of one scene, seen from one place.
+    """Draws the views of one scene from one camera.
 
     Args:
-        scene: what there is to see.
+        scene: the parts to draw.
         camera: the camera.
         settings: the size of the pictures.
-        first: a view, to see what stands where.
+        first: a view that shows where the fixed parts are.
 
     Raises:
-        NoDisplayError: it cannot draw on this machine.
+        NoDisplayError: the renderer cannot draw on this machine.
     """
 
     def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
@@ -41,7 +41,7 @@ class Renderer(ABC):
 
     @abstractmethod
     def render(self, view: View) -> Picture:
-        """The picture of a view, a fresh array."""
+        """Draw a view; the picture is a fresh array."""
 
-    def close(self) -> None:  # noqa: B027 - some have nothing to free
-        """Free what it holds; nothing else is called afterwards."""
+    def close(self) -> None:  # noqa: B027 - some renderers have nothing to free
+        """Free the renderer's resources. No other method is called afterwards."""

@@ -1,4 +1,4 @@
-"""View: what a renderer sees of an arm."""
+"""View: what a renderer needs to draw an arm."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from gym_mara.types import Floats
 
 @dataclass(frozen=True, eq=False, slots=True)
 class View:
-    """One arm at one instant, as it is to be shown."""
+    """One arm and its target at one instant."""
 
     q: Floats
-    """(J,), rad."""
+    """Joint positions (J,), rad (m for a prismatic joint)."""
     target_position: Floats
-    """(3,), m, in the world frame."""
+    """The target's position in the world frame (3,), m."""
     target_quaternion: Floats
-    """(4,), [w, x, y, z]."""
+    """The target's orientation in the world frame (4,), [w, x, y, z]."""
     touching: frozenset[str] = frozenset()
-    """The links that collide."""
+    """The names of the links that collide."""

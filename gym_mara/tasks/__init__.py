@@ -1,4 +1,4 @@
-"""The tasks by name; each is registered as the environment `gym_mara/NAME`."""
+"""The named tasks. Each is registered as the environment `gym_mara/NAME`."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ TASKS: dict[str, Task] = {
 PAPER_TASKS = tuple(TASKS)[:4]
 """The four environments of ROS2Learn."""
 MAX_EPISODE_STEPS = 2048
-"""The length of an episode of the environments that are registered by name."""
+"""The episode length of the registered environments, steps."""
 
 
 def named_task(task: str | Task) -> Task:
-    """The task of this name, or the task itself.
+    """Return the task with this name, or the task itself.
 
     Raises:
         GymMaraError: the name is unknown.

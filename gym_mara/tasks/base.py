@@ -1,4 +1,4 @@
-"""The contract of a task: it judges the state of N arms against their goals, and knows no engine."""
+"""The contract of a task: it observes and rewards the state of N arms with their goals, and does not depend on a backend."""
 
 from __future__ import annotations
 
@@ -23,54 +23,56 @@ ON_COLLISION = ("reset", "terminate", "continue")
 
 
 class Workspace(Protocol):
-    """Which poses the end effector can have. A pose is a position (3,), m, and a quaternion (4,), [w, x, y, z]."""
+    """The poses that the end effector can reach. A pose is a position (3,), m, and a quaternion (4,), [w, x, y, z]."""
 
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """The pose of a random configuration without a collision."""
+        """The pose of a random collision-free configuration."""
 
     def default_pose(self) -> tuple[Floats, Floats]:
-        """The pose of a configuration without a collision, always the same for a robot."""
+        """The pose of a collision-free configuration, always the same for a robot."""
 
     def shortfall(self, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
-        """How near the arm can come to a pose: the distance left, m, and the angle left, rad."""
+        """How close the arm can come to a pose: the remaining distance, m, and the remaining angle, rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """The poses to reach, in the world frame."""
+    """The target pose of each of N arms, in the world frame."""
 
     position: Floats
-    """(N, 3), m."""
+    """Positions (N, 3), m."""
     quaternion: Floats
-    """(N, 4), [w, x, y, z]."""
+    """Quaternions (N, 4), [w, x, y, z]."""
 
     @cached_property
     def _inverse(self) -> Floats:
-        # Contiguous: the last bits of a dot product depend on the memory layout, which a copy would change.
+        # Contiguous: the last bits of a dot product depend on the memory layout, and copying an array can change its layout.
         return np.ascontiguousarray(rotations.right_matrix(rotations.conjugate(self.quaternion)))
 
     def orientation_error(self, quaternion: Floats) -> Floats:
-        """q ⊗ conj(goal) (N, 4), w >= 0, of end-effector orientations q (N, 4)."""
+        """The rotation from the goal to the end effector: q ⊗ conj(goal) (N, 4), w >= 0, for orientations q (N, 4)."""
         return rotations.canonical(np.vecdot(self._inverse, quaternion[..., None, :]))
 
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """What the arms are to do. A subclass is a frozen dataclass of plain values; each is a keyword argument.
+    """The goal, the observation and the reward of an environment.
 
-    Observation and reward are written for N arms at once: the first axis of every array is N.
+    A subclass is a frozen dataclass of plain values. Each value is a keyword argument of the environments. Observation
+    and reward are computed for N arms at once: the first axis of every array is N.
 
     Raises:
-        GymMaraError: a value is of the wrong form or out of its range.
+        GymMaraError: a value has the wrong form or is out of its range.
     """
 
     random_goal: ClassVar[bool] = False
-    """Whether each episode has its own goal, from `draw_goal`."""
+    """Whether `draw_goal` draws a new goal for each episode."""
 
     on_collision: str = "reset"
-    """What follows a collision: "reset" (back to the start pose, the episode goes on), "terminate" or "continue"."""
+    """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or
+    "continue"."""
     start_q: tuple[float, ...] | None = None
-    """The start pose (J,), rad; None for the robot's home."""
+    """The start configuration (J,), rad (m for a prismatic joint); None for the robot's home configuration."""
 
     def __post_init__(self) -> None:
         if self.on_collision not in ON_COLLISION:
@@ -78,7 +80,7 @@ class Task(ABC):
         self._make_plain("start_q", None)
 
     def _make_plain(self, name: str, length: int | None) -> None:
-        """Turn a vector option into a tuple of floats, so that tasks compare, print and go through JSON."""
+        """Convert a vector option to a tuple of floats, so that tasks can be compared, printed and stored as JSON."""
         values = getattr(self, name)
         if values is None:
             return
@@ -87,43 +89,45 @@ class Task(ABC):
         except (TypeError, ValueError) as error:
             raise GymMaraError(f"{name} must be a list of numbers, not {values!r}") from error
         if array.ndim != 1 or (length and len(array) != length) or not np.isfinite(array).all():
-            wanted = f"{length} " if length else ""
-            raise GymMaraError(f"{name} must be a list of {wanted}finite numbers, not {values!r}")
+            count = f"{length} " if length else ""
+            raise GymMaraError(f"{name} must be a list of {count}finite numbers, not {values!r}")
         object.__setattr__(self, name, tuple(array.tolist()))
 
     @abstractmethod
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
-        """The goal of each arm."""
+        """The goals of N arms before the first episode; they stay if `random_goal` is false."""
 
     def draw_goal(
         self, workspace: Workspace, generator: np.random.Generator
     ) -> tuple[Floats, Floats]:
-        """The goal of one episode: position (3,), m, and quaternion (4,), [w, x, y, z]; called if `random_goal` is true.
+        """Draw the goal of one episode: position (3,), m, and quaternion (4,), [w, x, y, z].
+
+        Environments call this method only if `random_goal` is true.
 
         Args:
-            workspace: which poses the arm can reach.
-            generator: the arm's source of random goals.
+            workspace: the poses that the arm can reach.
+            generator: the random generator of the arm's goals.
         """
         raise NotImplementedError
 
     @abstractmethod
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
-        """The parts of an observation, in their order.
+        """The parts of the observation, in order.
 
         Args:
             robot: the arm.
-            goal: the goals at first; with `random_goal` they change.
-            joint_velocity: how fast the joints can be (J,), rad/s.
+            goal: the initial goals; they change with `random_goal`.
+            joint_velocity: the largest speed of each joint (J,), rad/s.
         """
 
     @abstractmethod
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
-        """The rewards (N,), and the terms that they are made of, each (N,), which `info` reports.
+        """The rewards (N,), and their terms by name, each (N,), which `info` reports.
 
-        Three names have a meaning elsewhere: the episode's statistics are those of `distance` (m), and an evaluation
-        prints `position_error` (m) and `angle_error` (rad).
+        Three names have a special meaning: the episode statistics use `distance` (m), and an evaluation prints
+        `position_error` (m) and `angle_error` (rad).
         """
 
     def terminated(self, state: SimState, goal: Goal) -> Mask:
-        """Which arms' episodes the task ends (N,); what follows a collision is for the environment."""
+        """The arms (N,) whose episodes the task terminates. The environment handles collisions."""
         return np.zeros(len(state.q), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Observations: named parts with their bounds, flattened into one array."""
+"""Observations: named parts with bounds, concatenated into one array."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gym_mara.tasks.base import Goal
 
 _ONE = 1.0 + 1e-9
-"""The bound of a unit quaternion's components, which rounding may exceed."""
+"""The bound of a unit quaternion's components, with a margin for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class Part:
     high: Floats
     """The upper bounds (K,)."""
     values: Callable[[SimState, Goal], Floats]
-    """The values (N, K) of N arms; a function of a module, so that environments pickle."""
+    """Computes the values (N, K) for N arms. It must be a module-level function, so that environments can be pickled."""
 
 
 class Observation:
-    """Flattens parts, in their order.
+    """Concatenates parts into one flat array.
 
     Args:
-        parts: the parts.
+        parts: the parts, in order.
 
     Raises:
         GymMaraError: two parts have the same name, or a part's bounds differ in shape.
@@ -51,7 +51,7 @@ class Observation:
         for part in parts:
             if np.ndim(part.low) != 1 or np.shape(part.low) != np.shape(part.high):
                 raise GymMaraError(
-                    f"the bounds of {part.name!r} must be two arrays of one shape (K,), "
+                    f"the bounds of {part.name!r} must be two arrays of the same shape (K,), "
                     f"not {np.shape(part.low)} and {np.shape(part.high)}"
                 )
         self.parts = tuple(parts)
@@ -64,11 +64,11 @@ class Observation:
         self._ends = np.cumsum([len(part.low) for part in parts]).tolist()
 
     def __call__(self, state: SimState, goal: Goal) -> Floats:
-        """The flat observations (N, O) of N arms, a fresh array."""
+        """Compute the flat observations (N, O) of N arms, a fresh array."""
         return np.concatenate([part.values(state, goal) for part in self.parts], axis=-1)
 
     def split(self, flat: Floats) -> dict[str, Floats]:
-        """The parts, by name, of flat observations (…, O): views (…, K)."""
+        """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""
         starts = [0, *self._ends[:-1]]
         return {
             part.name: flat[..., start:end]
@@ -77,52 +77,52 @@ class Observation:
 
 
 def joint_positions(robot: RobotModel) -> Part:
-    """The joint positions (J), rad (m for a prismatic joint)."""
+    """The joint positions (J,), rad (m for a prismatic joint)."""
     return Part("joint_positions", robot.lower, robot.upper, _joint_positions)
 
 
 def position_error(robot: RobotModel, farthest: float) -> Part:
-    """The position of the end effector minus the target's (3), m.
+    """The position of the end effector minus the position of the target (3,), m.
 
     Args:
         robot: the arm.
-        farthest: how far a target can be from the world's origin, m.
+        farthest: the largest possible distance of a target from the world's origin, m.
     """
     return _symmetric("position_error", robot.extent + farthest, _position_error)
 
 
 def orientation_error() -> Part:
-    """The rotation from the target to the end effector, q_ee ⊗ conj(q_target) (4), [w, x, y, z], w >= 0."""
+    """The rotation from the target to the end effector, q_ee ⊗ conj(q_target) (4,), [w, x, y, z], w >= 0."""
     return _quaternion("orientation_error", _orientation_error)
 
 
 def tool_velocity(robot: RobotModel, joint_velocity: Floats) -> Part:
-    """The linear velocity of the end effector (3), m/s.
+    """The linear velocity of the end effector (3,), m/s.
 
     Args:
         robot: the arm.
-        joint_velocity: how fast its joints can be (J,), rad/s.
+        joint_velocity: the largest speed of each joint (J,), rad/s.
     """
     return _symmetric("tool_velocity", float((robot.reach * joint_velocity).sum()), _tool_velocity)
 
 
 def tool_position(robot: RobotModel) -> Part:
-    """The position of the end effector in the world frame (3), m."""
+    """The position of the end effector in the world frame (3,), m."""
     return _symmetric("tool_position", robot.extent, _tool_position)
 
 
 def tool_quaternion() -> Part:
-    """The orientation of the end effector (4), [w, x, y, z], w >= 0."""
+    """The orientation of the end effector in the world frame (4,), [w, x, y, z], w >= 0."""
     return _quaternion("tool_quaternion", _tool_quaternion)
 
 
 def target_position(robot: RobotModel) -> Part:
-    """The target's position in the world frame (3), m, for targets within reach."""
+    """The position of the target in the world frame (3,), m, for targets within reach."""
     return _symmetric("target_position", robot.extent, _target_position)
 
 
 def target_quaternion() -> Part:
-    """The target's orientation (4), [w, x, y, z], w >= 0."""
+    """The orientation of the target in the world frame (4,), [w, x, y, z], w >= 0."""
     return _quaternion("target_quaternion", _target_quaternion)
 
 

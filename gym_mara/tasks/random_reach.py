@@ -1,4 +1,4 @@
-"""The reach task with another target in each episode, which the observation shows."""
+"""The reach task with a random target in each episode; the observation contains the target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RandomReachTask(ReachTask):
-    """Bring the end effector to a pose that is drawn for each episode, one of a configuration without a collision."""
+    """Bring the end effector to a random target pose, drawn for each episode.
+
+    The target is the pose of a random collision-free configuration, so it can be reached.
+    """
 
     random_goal: ClassVar[bool] = True
 
@@ -29,7 +32,7 @@ class RandomReachTask(ReachTask):
         super().__post_init__()
         if self.target_position is not None or self.target_quaternion is not None:
             raise GymMaraError(
-                "this task draws its targets: leave out target_position and target_quaternion, or take MARA-v0"
+                "this task draws its targets: leave out target_position and target_quaternion, or choose the task MARA-v0"
             )
 
     def draw_goal(
@@ -41,7 +44,7 @@ class RandomReachTask(ReachTask):
         return robot.extent
 
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
-        """As ReachTask, then the target's position, and its quaternion if the orientation counts."""
+        """The parts of ReachTask, then the position of the target, and its quaternion with `orientation`."""
         parts = [*super().observation(robot, goal, joint_velocity)]
         parts.append(observation.target_position(robot))
         if self.orientation:

@@ -1,4 +1,4 @@
-"""The viewer in the browser."""
+"""The viewer: shows an arm in the browser and lets the user move it."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def watch(
     speed: float = 1.0,
     seed: int | None = None,
 ) -> None:
-    """Open a viewer and play until the user interrupts.
+    """Open a viewer and step an environment until the user interrupts with Ctrl+C.
 
     Args:
         task: the name of a task.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: the joint targets (1, J), rad, for observations (1, O), episode after episode; without one the sliders lead
-            the joints, from home and without an end.
-        speed: how many times faster than real time.
-        seed: of the environment.
+        policy: maps observations (1, O) to joint targets (1, J), rad; it plays one episode after the other. None: the
+            user moves the joints with the sliders, from the home configuration, in one episode without an end.
+        speed: the speed of the simulation relative to real time.
+        seed: the seed of the environment.
 
     Raises:
         GymMaraError: a name is unknown, a value is out of its range, or the viewer cannot listen on its address.

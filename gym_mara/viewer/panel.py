@@ -13,9 +13,9 @@ from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.types import Floats
 
 _SLIDER_STEP = 0.001
-"""rad."""
+"""The resolution of the joint sliders, rad."""
 _HISTORY = 300
-"""How many steps the plots show."""
+"""The number of steps that the plots show."""
 _COLOURS = ("#1f77b4", "#2ca02c", "#ff7f0e", "#d62728", "#9467bd", "#111111")
 
 
@@ -23,9 +23,9 @@ class Panel:
     """Controls and plots of one arm.
 
     Args:
-        server: the viser server that shows them.
+        server: the viser server that shows the panel.
         simulation: the simulation.
-        q: the configuration (J,), rad, that the sliders begin at.
+        q: the initial joint positions of the sliders (J,), rad.
     """
 
     def __init__(self, server: viser.ViserServer, simulation: Simulation, q: Floats) -> None:
@@ -33,7 +33,7 @@ class Panel:
         self._low, self._high = simulation.target_low, simulation.target_high
         self._history: deque[dict[str, float]] = deque(maxlen=_HISTORY)
         gui = server.gui
-        # A server that listens on this machine alone must not be shared with the world by a click.
+        # The share button would make the server public; it must be reachable from this machine only.
         gui.configure_theme(show_share_button=False)
         self.play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT, disabled=True)
@@ -44,43 +44,43 @@ class Panel:
             "Backend", backend_names(), initial_value=simulation.backend_name
         )
         with gui.add_folder("Joints, rad"):
-            self.jogging = gui.add_checkbox("By hand", initial_value=False)
+            self.jogging = gui.add_checkbox("Jog", initial_value=False)
             start = q.clip(self._low, self._high)
             bounds = zip(simulation.robot.joint_names, self._low, self._high, start, strict=True)
             self.sliders = [
                 gui.add_slider(name, low, high, step=_SLIDER_STEP, initial_value=float(value))
                 for name, low, high, value in bounds
             ]
-        # The names of the values that a plot shows, their scale, and the plot.
+        # For each plot: the names of its values, their scale, and the handle.
         self._plots: list[tuple[list[str], float, Any]] = []
 
     @property
     def speed(self) -> float:
-        """How many times faster than real time."""
+        """The speed relative to real time."""
         return float(self._speed.value)
 
     def set_speed(self, speed: float) -> None:
-        """Set the slider of the speed, within its range."""
+        """Set the speed relative to real time, clipped to the range of its slider."""
         self._speed.value = min(max(speed, self._speed.min), self._speed.max)
 
     def show_playing(self, playing: bool) -> None:
-        """Show the button that fits: Pause while playing, else Play and Step."""
+        """Show the Pause button while playing, else the Play and Step buttons."""
         self.play.label = "Pause" if playing else "Play"
         self.play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
         self.step.disabled = playing
 
     def targets(self) -> Floats:
-        """The joint targets (1, J), rad, of the sliders."""
+        """The joint targets (1, J), rad, that the sliders show."""
         return np.array([[slider.value for slider in self.sliders]]).clip(self._low, self._high)
 
     def refuse_backend(self, current: str, reason: str) -> None:
-        """Show that the backend stays as it is, and why."""
+        """Show the current backend again, and the reason why it was not switched."""
         self.backends.value = current
         for client in self._server.get_clients().values():
             client.add_notification("The backend was not switched", reason, color="red")
 
     def add(self, outcome: Outcome) -> None:
-        """Take up the result of a step for the plots."""
+        """Add the result of a step to the plots."""
         shown = {"reward": float(outcome.reward[0])}
         shown |= {
             name: float(values[0])
@@ -92,7 +92,7 @@ class Panel:
         self._history.append(shown)
 
     def _build_plots(self, shown: dict[str, float]) -> None:
-        """A plot of the reward and its terms, and one of the position error, which spans powers of ten."""
+        """Add a plot of the reward and its terms, and a plot of the position error with a logarithmic axis."""
         rewards = [name for name in shown if name.startswith("reward")]
         distance = [name for name in shown if name in ("position_error", "distance")][-1:]
         for title, names, scale, y in (
@@ -113,7 +113,7 @@ class Panel:
             self._plots.append((names, scale, plot))
 
     def update(self, simulation: Simulation, *, follow: bool) -> None:
-        """Draw the plots anew, and let the sliders follow the joints."""
+        """Redraw the plots. With `follow`, also set the sliders to the joint positions."""
         rows = list(self._history)
         steps = np.arange(len(rows), dtype=np.float64)
         for names, scale, plot in self._plots:

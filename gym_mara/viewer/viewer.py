@@ -1,4 +1,4 @@
-"""A viewer in the browser: it steps the simulation in real time, and its user can pause it, jog the joints, and drag the target."""
+"""Steps a simulation in real time and shows it in the browser; the user can pause, jog the joints and drag the target."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from gym_mara.viewer.browser_scene import BrowserScene
 from gym_mara.viewer.panel import Panel
 
 _FRAME_PERIOD = 1.0 / 30.0
-"""Between two pictures in the browser, s."""
+"""The time between two pictures in the browser, s."""
 _PLOT_PERIOD = 0.2
-"""Between two updates of the plots and sliders, s."""
+"""The time between two updates of the plots and sliders, s."""
 _CLOSING_TIME = 0.3
-"""How long the last message may take to the browser, s."""
+"""The time for the last message to reach the browser, s."""
 _PORTS = 100
-"""How many ports are tried, from the one that was asked for."""
+"""The number of ports to try, from the configured one upwards."""
 
 
 class Viewer:
     """Steps a simulation of one arm and shows it in the browser.
 
-    `step` takes one step when it is due, and does before it what the browser's user has asked for. All of it happens in
-    the thread that calls `step`; viser's threads only note what the user asks for.
+    `step` first handles the requests of the user in the browser, then waits until the next step is due, then steps. All
+    of this happens in the thread that calls `step`; viser's threads only store the requests.
 
     Args:
         simulation: the simulation.
-        settings: the camera that sees the scene at first, and the address to listen on.
+        settings: the initial camera, and the address to listen on.
 
     Raises:
         GymMaraError: the viewer cannot listen on the address.
@@ -59,21 +59,21 @@ class Viewer:
         self._goal: tuple[Floats, Floats] | None = None
         self._backend: str | None = None
         self._due = self._drawn = self._plotted = 0.0
-        self._server = _serve(settings, simulation.robot.name)
+        self._server = _start_server(settings, simulation.robot.name)
         self.url = f"http://{settings.viewer_host}:{self._server.get_port()}"
-        """Its address for a browser."""
+        """The address to open in a browser."""
         view, scene = view_of(simulation, 0), Scene(simulation.robot)
         self.camera = place_camera(scene, view, settings)
-        """The camera that a browser begins with."""
+        """The initial camera of a browser."""
         self._scene = BrowserScene(self._server, scene, self.camera, view)
         self._panel = Panel(self._server, simulation, view.q)
-        self._listen()
+        self._connect_controls()
 
     def run(self, policy: Callable[[Floats], ArrayLike], episode_steps: int | None) -> None:
-        """Play a policy, episode after episode, until the user interrupts.
+        """Play a policy, one episode after the other, until the user interrupts.
 
         Args:
-            policy: the joint targets (1, J), rad, for observations (1, O).
+            policy: maps observations (1, O) to joint targets (1, J), rad.
             episode_steps: the length of an episode; None for no end.
         """
         while True:
@@ -86,7 +86,9 @@ class Viewer:
                     break
 
     def step(self, targets: ArrayLike) -> Outcome:
-        """Take one step, when it is due, towards joint targets (1, J), rad; or towards the sliders, while the user jogs.
+        """Wait until the next step is due, then step towards joint targets (1, J), rad.
+
+        While the user jogs the joints, the sliders replace these targets.
 
         Raises:
             GymMaraError: the targets have the wrong shape or are not finite.
@@ -104,38 +106,40 @@ class Viewer:
         return outcome
 
     def show(self) -> None:
-        """Show the arm as it is."""
+        """Draw the arm in its current state."""
         self._drawn = time.monotonic()
         with _sender_errors_ignored():
             self._scene.show(view_of(self._simulation, 0))
 
     def jog(self) -> None:
-        """Let the sliders lead the joints, as if the user had moved one."""
+        """Take the joint targets from the sliders, as if the user had moved one."""
         self._panel.jogging.value = True
         self._request(_jogging=True)
 
     def set_speed(self, speed: float) -> None:
-        """Play at so many times real time, within the range of the slider."""
+        """Set the speed relative to real time, clipped to the range of its slider."""
         self._panel.set_speed(speed)
 
     def set_playing(self, playing: bool) -> None:
-        """Play, or pause before the next step; a pause holds only while a browser is connected."""
+        """Play, or pause before the next step. A pause lasts only while a browser is connected."""
         self._panel.show_playing(playing)
         self._request(_playing=playing, _single_steps=0)
 
     def close(self) -> None:
-        """Tell connected browsers, and stop listening."""
+        """Notify the connected browsers and stop the server."""
         clients = self._server.get_clients().values()
         for client in clients:
-            client.add_notification("Closed", "The environment was closed; the arm moves no more.")
+            client.add_notification(
+                "Closed", "The environment was closed; the arm no longer moves."
+            )
             client.flush()
         if clients:
             time.sleep(_CLOSING_TIME)
         self._server.stop()
 
-    # In viser's threads: note what the user asks for.
+    # The methods from here on run in viser's threads: they store requests.
 
-    def _listen(self) -> None:
+    def _connect_controls(self) -> None:
         panel = self._panel
         panel.play.on_click(lambda _: self.set_playing(not self._playing))
         panel.step.on_click(lambda _: self._request(_single_steps=self._single_steps + 1))
@@ -151,7 +155,7 @@ class Viewer:
             self._requests.notify_all()
 
     def _on_jogging(self, event: Any) -> None:
-        if event.client is not None:  # the user's change, not the viewer's own
+        if event.client is not None:  # the user made the change, not the viewer
             self._request(_jogging=self._panel.jogging.value)
 
     def _on_slider(self, event: Any) -> None:
@@ -166,17 +170,17 @@ class Viewer:
         if event.client is not None:
             self._request(_backend=self._panel.backends.value)
 
-    # In the thread that steps: do it.
+    # The methods from here on run in the thread that calls `step`: they handle the requests.
 
     def _wait(self) -> None:
-        """Do what the user has asked for, and wait until the next step is due."""
+        """Handle the user's requests, and wait until the next step is due."""
         while True:
-            self._do_requests()
+            self._handle_requests()
             with self._requests:
                 if self._goal is not None or self._backend is not None:
                     continue
                 if self._playing or not self._server.get_clients():
-                    break  # without a browser nothing is paused
+                    break  # a pause lasts only while a browser is connected
                 if self._single_steps:
                     self._single_steps -= 1
                     break
@@ -185,7 +189,7 @@ class Viewer:
         self._due = max(self._due + period / self._panel.speed, now - period)
         time.sleep(max(0.0, self._due - now))
 
-    def _do_requests(self) -> None:
+    def _handle_requests(self) -> None:
         with self._requests:
             goal, self._goal = self._goal, None
             backend, self._backend = self._backend, None
@@ -200,9 +204,9 @@ class Viewer:
 
 @contextmanager
 def _sender_errors_ignored() -> Iterator[None]:
-    """Go on where viser could not wake its sender: it does so from our thread, by an asyncio event that may be changing.
+    """Ignore a race in viser: it wakes its sender thread through an asyncio event that is not thread-safe.
 
-    By then the message is queued, and the next one wakes the sender.
+    The message is already queued, and the next message wakes the sender.
     """
     try:
         yield
@@ -211,11 +215,11 @@ def _sender_errors_ignored() -> Iterator[None]:
             raise
 
 
-def _serve(settings: RenderSettings, robot: str) -> viser.ViserServer:
-    """A server on the port that was asked for, or the next one that is free.
+def _start_server(settings: RenderSettings, robot: str) -> viser.ViserServer:
+    """Start a server on the configured port, or on the next free port.
 
     Raises:
-        GymMaraError: the address is not one of this machine, or no port is free.
+        GymMaraError: the host is not an address of this machine, or no port is free.
     """
     host, first = settings.viewer_host, settings.viewer_port
     reason: OSError | None = None
@@ -227,9 +231,9 @@ def _serve(settings: RenderSettings, robot: str) -> viser.ViserServer:
             reason = error
             continue
         if port != first:
-            print(f"gym_mara: port {first} is in use; the viewer takes {port}", flush=True)
+            print(f"gym_mara: port {first} is in use; the viewer uses port {port}", flush=True)
         return viser.ViserServer(host, port, label=f"gym_mara: {robot}", verbose=False)
     raise GymMaraError(
-        f"the viewer cannot listen on {host!r}, port {first} or one of the {_PORTS - 1} after it: {reason}; "
+        f"the viewer cannot listen on {host!r}, port {first} or any of the next {_PORTS - 1} ports: {reason}; "
         "choose another viewer_host or viewer_port"
     ) from reason

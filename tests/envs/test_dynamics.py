@@ -11,7 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from gym_mara.backends.dart.backend import DartBackend, SimulationDivergedError
+from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.testing import COLLIDING_Q, COPIES
@@ -160,7 +161,7 @@ def test_it_goes_back_to_a_saved_state() -> None:
     assert str(_course(env, 10, seed=1)) == first
 
 
-def _lose(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
+def _diverge(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
     backend = env.simulation.backend
     assert isinstance(backend, DartBackend)
     backend.arms[arm].set_state(np.zeros(6), np.full(6, 1e200))
@@ -169,7 +170,7 @@ def _lose(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
 def test_a_simulation_that_diverges_ends_in_an_error() -> None:
     env = MaraEnv(backend="dart")
     env.reset()
-    _lose(env)
+    _diverge(env)
     with pytest.raises(SimulationDivergedError, match="on_divergence='truncate'"):
         env.step(STILL)
 
@@ -178,7 +179,7 @@ def test_or_truncates_the_episode_and_nothing_is_nan() -> None:
     env = MaraEnv("MARACollisionOrient-v0", backend="dart", on_divergence="truncate")
     env.reset()
     env.step(STILL + 0.1)
-    _lose(env)
+    _diverge(env)
     observation, reward, terminated, truncated, _ = env.step(STILL + 0.1)
     assert np.isfinite(observation).all()
     assert np.isfinite(reward)
@@ -187,14 +188,14 @@ def test_or_truncates_the_episode_and_nothing_is_nan() -> None:
     assert not env.step(STILL + 0.1)[3]
 
 
-def test_in_a_vector_env_only_the_lost_arm_begins_anew() -> None:
+def test_in_a_vector_env_only_the_arm_that_diverged_begins_anew() -> None:
     envs = MaraVectorEnv(
         3, backend="dart", on_divergence="truncate", autoreset_mode="SameStep", workers=1
     )
     envs.reset()
     for _ in range(3):
         envs.step(np.full((3, 6), 0.3))
-    _lose(envs, 1)
+    _diverge(envs, 1)
     observation, reward, _, truncated, info = envs.step(np.full((3, 6), 0.3))
     assert truncated.tolist() == [False, True, False]
     assert np.isfinite(observation).all()

@@ -1,4 +1,4 @@
-"""Observations: named parts with bounds, flattened in order."""
+"""Observations: named parts with bounds, concatenated in order."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def _observation(task: str, robot: RobotModel) -> tuple[Observation, Goal]:
 def _state(robot: RobotModel) -> SimState:
     q = uniform_q(robot, 5, 0)
     position, quaternion = robot.kinematics().pose(q)
-    nothing = np.zeros((5, 3))
+    no_velocity = np.zeros((5, 3))
     return SimState(
-        q, 0.0 * q, position, quaternion, nothing, np.zeros(5, np.bool_), np.arange(5.0)
+        q, 0.0 * q, position, quaternion, no_velocity, np.zeros(5, np.bool_), np.arange(5.0)
     )
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("robot", ["mara", "panda"])
-def test_the_parts_split_what_they_flatten(task: str, robot: str) -> None:
+def test_split_recovers_the_parts_of_a_flat_observation(task: str, robot: str) -> None:
     arm = robot_model(robot)
     observation, goal = _observation(task, arm)
     state = _state(arm)
@@ -52,27 +52,27 @@ def test_the_parts_split_what_they_flatten(task: str, robot: str) -> None:
         assert observation.space.contains(row)
 
 
-def test_the_bounds_stand_beside_the_values(mara: RobotModel) -> None:
+def test_the_bounds_have_the_order_of_the_values(mara: RobotModel) -> None:
     observation, _ = _observation("MARAOrient-v0", mara)
     bounds = observation.split(np.array(observation.space.high))
     for part in observation.parts:
         np.testing.assert_array_equal(bounds[part.name], part.high)
 
 
-def test_a_part_of_ones_own_is_observed_and_pickles(mara: RobotModel) -> None:
+def test_a_custom_part_is_observed_and_can_be_pickled(mara: RobotModel) -> None:
     observation, goal = _observation("MARA-v0", mara)
     clock = Part("clock", np.zeros(1), np.full(1, np.inf), _time)
-    mine: Observation = pickled(Observation([*observation.parts, clock]))
-    np.testing.assert_array_equal(mine(_state(mara), goal)[:, -1], np.arange(5.0))
+    extended: Observation = pickled(Observation([*observation.parts, clock]))
+    np.testing.assert_array_equal(extended(_state(mara), goal)[:, -1], np.arange(5.0))
 
 
-def test_two_parts_of_one_name_are_refused(mara: RobotModel) -> None:
+def test_two_parts_with_the_same_name_are_refused(mara: RobotModel) -> None:
     observation, _ = _observation("MARA-v0", mara)
     with pytest.raises(GymMaraError, match="two parts of an observation have the same name"):
         Observation([*observation.parts, observation.parts[0]])
 
 
 @pytest.mark.parametrize("high", [np.zeros(2), np.zeros((1, 3)), np.float64(0.0)])
-def test_bounds_that_do_not_fit_each_other_are_refused(high: Floats) -> None:
+def test_bounds_of_different_shapes_are_refused(high: Floats) -> None:
     with pytest.raises(GymMaraError, match="bounds of 'odd'"):
         Observation([Part("odd", np.zeros(3), high, _time)])
