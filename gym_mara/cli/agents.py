@@ -148,7 +148,6 @@ def transfer(
 ) -> None:
     """Play a run's policy on every installed backend, and compare the results."""
     with needs_agents():
-        from gym_mara.agents.inspection.rollout import installed_backends
         from gym_mara.agents.inspection.transfer import transfer as play_on_all
         from gym_mara.agents.runs.folder import RunFolder
 
@@ -168,8 +167,6 @@ def transfer(
     for index, name in enumerate(names, start=1):
         table.add_row(name, *(_mean_and_spread(np.asarray(row[index])) for row in rows))
     out.print(table)
-    for line in installed_backends()[1]:
-        out.print(line, markup=False, soft_wrap=True)
 
 
 @contextmanager
