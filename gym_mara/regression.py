@@ -15,15 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.inverse_kinematics import solve_ik
-
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats
 
 _HEADER = "# gym_mara reward record: "
 
@@ -78,13 +76,13 @@ def record(
         raise GymMaraError(f"states must be at least 2, not {states}")
     simulation = _simulation(env, backend, options or {}, 1)
     try:
-        q = _grid(simulation, states)
+        q = _sample_q(simulation, states)
     finally:
         simulation.close()
-    return evaluate(env, backend, options or {}, q)
+    return compute(env, backend, options or {}, q)
 
 
-def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
+def compute(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
     """Compute the rewards of an environment with the arm at rest at configurations q (S, J), rad.
 
     Raises:
@@ -132,7 +130,7 @@ def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> li
         GymMaraError: the file is missing or damaged, or the task now has other terms.
     """
     recorded = read(file)
-    now = evaluate(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
+    now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
     return compare(recorded, now, tolerance)
 
 
@@ -190,7 +188,7 @@ def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) 
     return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
 
 
-def _grid(simulation: Simulation, states: int) -> Floats:
+def _sample_q(simulation: Simulation, states: int) -> Floats:
     """The configurations (S, J) of `record`, rad."""
     robot, goal = simulation.robot, simulation.goal
     # The Kronecker sequence of the generalised golden ratio is evenly spread in any number of dimensions.
@@ -198,10 +196,10 @@ def _grid(simulation: Simulation, states: int) -> Floats:
     for _ in range(64):
         phi = (1.0 + phi) ** (1.0 / (robot.num_joints + 1))
     steps = phi ** -np.arange(1.0, robot.num_joints + 1)
-    spread_out = states // 2
-    unit = (0.5 + np.outer(np.arange(1, spread_out + 1), steps)) % 1.0
+    num_even = states // 2
+    unit = (0.5 + np.outer(np.arange(1, num_even + 1), steps)) % 1.0
     even = simulation.target_low + unit * (simulation.target_high - simulation.target_low)
     at_target = solve_ik(robot, goal.position[0], goal.quaternion[0])
-    left = np.geomspace(1.0, 1e-4, states - spread_out)[:, None]
-    near = at_target + left * (robot.home - at_target)
+    remaining = np.geomspace(1.0, 1e-4, states - num_even)[:, None]
+    near = at_target + remaining * (robot.home - at_target)
     return np.vstack([even, near])

@@ -15,7 +15,7 @@ import psutil
 import pytest
 from hypothesis import settings
 
-from gym_mara.agents.experiments.local import ONE_THREAD
+from gym_mara.agents.experiments.executor import ONE_THREAD
 from gym_mara.robot import RobotModel
 from tests.helpers import robot_model, write
 

@@ -82,7 +82,7 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     assert "position error, mm" in out
     code, out, _ = gym_mara("transfer", run)
     assert code == 0
-    assert all(word in out for word in ("dart", "pinocchio", "settled after", "highest torque"))
+    assert all(word in out for word in ("dart", "pinocchio", "settling time", "highest torque"))
     code, out, _ = gym_mara("evaluate", run, "--episodes", "2", "--json", "--policy", "best")
     assert code == 0
     metrics = json.loads(out)
@@ -137,10 +137,10 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
         (["train", "--preset", "papers", "--out", "x"], "unknown preset 'papers'"),
         (["benchmark", "--algos", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
         (["benchmark", "--envs", "MARA-v1", "--out", "x"], "unknown environment 'MARA-v1'"),
-        (["benchmark", "--envs", "MARA-v0, MARA-v0", "--out", "x"], "name each once"),
-        (["benchmark", "--algos", "ppo, trpo ,ppo", "--out", "x"], "name each once"),
+        (["benchmark", "--envs", "MARA-v0, MARA-v0", "--out", "x"], "give each name once"),
+        (["benchmark", "--algos", "ppo, trpo ,ppo", "--out", "x"], "give each name once"),
         (["benchmark", "--jobs", "0", "--out", "x"], "--jobs must be"),
-        (["plot", "nowhere"], "is no grid"),
+        (["plot", "nowhere"], "holds no grid"),
         (["search", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
         (["evaluate", "nowhere"], "is no run folder"),
         (["rewards"], "either --record FILE or --check FILE"),

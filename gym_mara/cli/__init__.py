@@ -30,11 +30,11 @@ app.command()(environments.rewards)
 
 
 def main() -> None:
-    """Run the command; what the user can mend is told in a line, without a traceback."""
+    """Run the command; an error that the user can correct is printed as one line, without a traceback."""
     try:
         app()
     except GymMaraError as error:
-        # A Text, not a string: an extra's brackets are no markup.
+        # A Text, because rich would read the brackets of an extra, as in gym_mara[train], as markup.
         text = Text.assemble(("error: ", "bold red"), str(error))
         Console(stderr=True).print(text, soft_wrap=True)
         sys.exit(2)

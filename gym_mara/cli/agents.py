@@ -1,4 +1,4 @@
-"""gym-mara train, evaluate and transfer: one run."""
+"""gym-mara train, evaluate and transfer: the commands for one run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.table import Column, Table
 
 from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
@@ -20,6 +19,7 @@ from gym_mara.cli.common import (
     AlgoOption,
     BackendOption,
     EnvOption,
+    PolicyOption,
     PresetOption,
     SetOption,
     interruptible,
@@ -30,6 +30,7 @@ from gym_mara.cli.common import (
     whole,
 )
 from gym_mara.errors import GymMaraError
+from gym_mara.types import Floats
 
 if TYPE_CHECKING:
     from gym_mara.agents.runs.folder import RunFolder
@@ -51,39 +52,42 @@ def train(
     steps: Annotated[
         float, typer.Option(help="Environment steps over all arms, such as 1e6.")
     ] = 1e6,
-    seed: Annotated[int, typer.Option(help="Seed of policy, sampling and environment.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the policy, the sampling and the environment.")
+    ] = 0,
     out_folder: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="New run folder; by default one under runs/ named after run and time."
+            "--out",
+            help="New run folder; by default a folder in runs/ named after the run and the time.",
         ),
     ] = None,
     preset: PresetOption = DEFAULT_PRESET,
     checkpoint_every: Annotated[
-        float, typer.Option(help="Steps between two checkpoints, each of which is evaluated.")
+        float, typer.Option(help="Steps between two checkpoints; each is evaluated.")
     ] = 5e4,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     resume: Annotated[
         Path | None,
-        typer.Option(help="Go on with this run from its last checkpoint; all else is as it was."),
+        typer.Option(help="Resume this run from its last checkpoint, with its own options."),
     ] = None,
 ) -> None:
-    """Train an agent and leave a run folder: policy, checkpoints, learning curve, TensorBoard log."""
+    """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log."""
     with needs_agents():
         from gym_mara.agents.runs.folder import RunConfig, RunFolder
-        from gym_mara.agents.training.train import resume as go_on
-        from gym_mara.agents.training.train import train as begin
+        from gym_mara.agents.training.train import resume as resume_training
+        from gym_mara.agents.training.train import train as start_training
 
     if resume is not None:
         _refuse_beside_resume(context)
         out.print(
-            "Going on unpickles the run's checkpoint, and a pickle can run any code: "
-            "do so only with runs that you trust.",
+            "Resuming unpickles the run's checkpoint, and a pickle can run any code: "
+            "resume only runs that you trust.",
             style="yellow",
             soft_wrap=True,
         )
-        with _progress(RunFolder.open(resume).config.steps, resume) as report:
-            run = go_on(resume, report)
+        with _progress(RunFolder.open(resume).config.steps, resume) as on_progress:
+            run = resume_training(resume, on_progress)
     else:
         config = RunConfig(
             env=task_name(env),
@@ -97,34 +101,30 @@ def train(
         )
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         folder = out_folder or Path("runs") / f"{algo}_{config.env}_{backend}_seed{seed}_{stamp}"
-        with _progress(config.steps, folder) as report:
-            run = begin(config, folder, report)
+        with _progress(config.steps, folder) as on_progress:
+            run = start_training(config, folder, on_progress)
     _print_evaluation(run, episodes=1)
     out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
-    """A run goes on as it was begun: raises GymMaraError where other options were given."""
+    """Raises GymMaraError if other options are given: a run is resumed with its own."""
     given = []
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if parameter.name != "resume" and source is not None and source.name == "COMMANDLINE":
             given.append(parameter.opts[0])
     if given:
-        raise GymMaraError(
-            f"--resume goes on with a run as it was begun: leave out {', '.join(given)}"
-        )
+        raise GymMaraError(f"--resume uses the options of the run: leave out {', '.join(given)}")
 
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="A run folder.")],
     backend: Annotated[
-        str | None, typer.Option(help="Backend to play on; by default the run's own.")
+        str | None, typer.Option(help="Backend to play on; by default that of the run.")
     ] = None,
     episodes: Annotated[int, typer.Option(help="How many episodes to play.")] = 10,
-    policy: Annotated[
-        str, typer.Option(help="last, or best: the one that did best when evaluated in training.")
-    ] = "last",
+    policy: PolicyOption = "last",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
 ) -> None:
     """Play a run's deterministic policy: position error and angle at the last step, reward, collisions."""
@@ -143,22 +143,22 @@ def evaluate(
 def transfer(
     run: Annotated[Path, typer.Argument(help="A run folder.")],
     episodes: Annotated[int, typer.Option(help="How many episodes to play on each backend.")] = 1,
-    policy: Annotated[str, typer.Option(help="last or best.")] = "last",
+    policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Play a run's policy on every backend, side by side: what it loses between simulations."""
+    """Play a run's policy on every installed backend, and compare the results."""
     with needs_agents():
-        from gym_mara.agents.inspection.transfer import transfer as play
+        from gym_mara.agents.inspection.transfer import transfer as play_on_all
         from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
-    rows = play(folder, episodes=episodes, which=policy, options=keyword_arguments(settings))
+    rows = play_on_all(folder, episodes=episodes, which=policy, options=keyword_arguments(settings))
     names = (
         "position error, mm",
         "angle, deg",
         "return",
         "collisions",
-        "settled after, s",
+        "settling time, s",
         "highest torque / limit",
         "highest speed, rad/s",
     )
@@ -171,7 +171,7 @@ def transfer(
 
 @contextmanager
 def _progress(total: int, run: Path) -> Iterator[Any]:
-    """A bar of progress, as the function that a training reports to; an interrupt says how to go on."""
+    """A progress bar, updated by the function that this yields; after an interrupt it says how to resume."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -181,23 +181,22 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
         TextColumn("{task.description}"),
     )
     interrupted = (
-        f"Interrupted. What was trained up to the last checkpoint is kept; go on with\n"
-        f"gym-mara train --resume {run}"
+        f"Interrupted. The last checkpoint is kept; resume with\ngym-mara train --resume {run}"
     )
     bar = Progress(*columns, console=out)
     task = bar.add_task("", total=total)
 
     with interruptible(interrupted):
 
-        def report(steps: int, shown: dict[str, float]) -> None:
-            bar.start()  # once the training begins: what is refused before shows no bar
+        def on_progress(steps: int, shown: dict[str, float]) -> None:
+            bar.start()  # not before the training has started: an error before shows no bar
             text = f"reward {shown['reward_per_step']:6.2f}" if "reward_per_step" in shown else ""
             if "eval_position_error_mm" in shown:
                 text += f"   evaluated: {shown['eval_position_error_mm']:.1f} mm"
             bar.update(task, completed=min(steps, total), description=text)
 
         try:
-            yield report
+            yield on_progress
         finally:
             bar.stop()
 
@@ -215,7 +214,7 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
     out.print(table)
 
 
-def _mean_and_spread(values: NDArray[np.float64]) -> str:
+def _mean_and_spread(values: Floats) -> str:
     mean, spread = values.mean(), values.std()
     if np.isnan(mean):
         return "-"

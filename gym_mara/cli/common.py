@@ -1,4 +1,4 @@
-"""What the commands share: the console, common options, and how their values are read."""
+"""What the commands share: the console, options, and the parsing of their values."""
 
 from __future__ import annotations
 
@@ -19,10 +19,16 @@ out = Console()
 
 EnvOption = Annotated[str, typer.Option("--env", help="Environment: " + ", ".join(TASKS) + ".")]
 AlgoOption = Annotated[str, typer.Option(help="Algorithm: " + ", ".join(ALGORITHMS) + ".")]
+PolicyOption = Annotated[
+    str,
+    typer.Option(
+        help="last, or best: the policy with the highest reward in the evaluations of the training."
+    ),
+]
 PresetOption = Annotated[
     str, typer.Option(help="Hyperparameters: " + " or ".join(preset_names()) + ".")
 ]
-BackendOption = Annotated[str, typer.Option(help="Backend: see gym-mara list.")]
+BackendOption = Annotated[str, typer.Option(help="Backend; gym-mara list shows all.")]
 SetOption = Annotated[
     list[str],
     typer.Option(
@@ -35,13 +41,13 @@ SetOption = Annotated[
 
 
 def needs_agents() -> AbstractContextManager[None]:
-    """Name the extra where a library that training needs is missing."""
+    """Raise an error that names the extra if a library for training is missing."""
     return needs("training and evaluation", "train")
 
 
 @contextmanager
 def interruptible(message: str) -> Iterator[None]:
-    """End with a message where the user interrupts."""
+    """Print a message and exit if the user interrupts."""
     try:
         yield
     except KeyboardInterrupt:
@@ -50,7 +56,7 @@ def interruptible(message: str) -> Iterator[None]:
 
 
 def task_name(env: str) -> str:
-    """The name of a task, with or without the namespace of its id."""
+    """The name of a task, given with or without the namespace of its id."""
     name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
     if name not in TASKS:
         raise unknown("environment", env, TASKS)
@@ -58,14 +64,14 @@ def task_name(env: str) -> str:
 
 
 def whole(option: str, value: float) -> int:
-    """The value of an option that must be a whole number of at least 1; 1e6 is one."""
+    """The value of an option that must be a whole number of at least 1, which may be written as 1e6."""
     if not (value >= 1 and value == value // 1):
         raise GymMaraError(f"{option} must be a whole number of at least 1, not {value:g}")
     return int(value)
 
 
 def keyword_arguments(settings: list[str]) -> dict[str, Any]:
-    """Keyword arguments from NAME=VALUE; a value that is not JSON is a string."""
+    """Keyword arguments from NAME=VALUE; a value that is not JSON is taken as a string."""
     options = {}
     for setting in settings:
         name, separator, value = setting.partition("=")

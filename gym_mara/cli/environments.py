@@ -33,14 +33,15 @@ def list_() -> None:
         table.add_row(entry.name, entry.summary, ", ".join(entry.presets))
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
-    out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
+    out.print("Robots:", ", ".join(robot_names()), "or the path of a URDF")
     out.print("Modules of an arm:", ", ".join(MODULES))
 
 
 def rewards(
-    record: Annotated[Path | None, typer.Option(help="New file to write the rewards to.")] = None,
+    record: Annotated[Path | None, typer.Option(help="New file for the rewards.")] = None,
     check: Annotated[
-        Path | None, typer.Option(help="Recorded file to compute anew; exits 1 if a value moved.")
+        Path | None,
+        typer.Option(help="Record to compare with; exits with 1 if a value has changed."),
     ] = None,
     env: EnvOption = "MARA-v0",
     backend: Annotated[
@@ -50,12 +51,12 @@ def rewards(
         ),
     ] = None,
     states: Annotated[int, typer.Option(help="How many states to record.")] = 256,
-    tolerance: Annotated[float, typer.Option(help="How far a value may move.")] = 1e-9,
+    tolerance: Annotated[float, typer.Option(help="How much a value may change.")] = 1e-9,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Guard a reward function: record its values over a fixed grid of states, or check them."""
+    """Guard a reward function: record its values in a fixed set of states, or compare them with a record."""
     if (record is None) == (check is None):
-        raise GymMaraError("say either --record FILE or --check FILE")
+        raise GymMaraError("give either --record FILE or --check FILE")
     if record is not None:
         made = regression.record(
             task_name(env), backend or DEFAULT_BACKEND, keyword_arguments(settings), states
@@ -67,6 +68,6 @@ def rewards(
         for value in moved:
             print(value)
         if moved:
-            print(f"{len(moved)} values of {check} moved by more than {tolerance:g}")
+            print(f"{len(moved)} values of {check} have changed by more than {tolerance:g}")
             raise typer.Exit(1)
-        out.print(f"{check}: nothing moved by more than {tolerance:g}")
+        out.print(f"{check}: no value has changed by more than {tolerance:g}")

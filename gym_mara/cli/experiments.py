@@ -1,4 +1,4 @@
-"""gym-mara benchmark, plot and search: many runs."""
+"""gym-mara benchmark, plot and search: the commands for many runs."""
 
 from __future__ import annotations
 
@@ -35,26 +35,24 @@ from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
+    from gym_mara.agents.experiments.executor import Executor
     from gym_mara.agents.experiments.grid import Grid
-    from gym_mara.agents.experiments.local import Engine
 
-ENGINES = ("local", "ray")
+EXECUTORS = ("local", "ray")
 
 StepsOption = Annotated[float, typer.Option(help="Environment steps of each run, such as 1e6.")]
 JobsOption = Annotated[
-    int | None, typer.Option(help="How many runs at a time; by default one a core.")
+    int | None, typer.Option(help="How many runs at a time; by default one on each core.")
 ]
 
 
 def benchmark(
-    envs: Annotated[str, typer.Option(help="Environments, with commas between them.")] = ",".join(
+    envs: Annotated[str, typer.Option(help="Environments, separated by commas.")] = ",".join(
         PAPER_TASKS
     ),
     algos: Annotated[
         str | None,
-        typer.Option(
-            help="Algorithms, with commas between them; by default all that have the preset."
-        ),
+        typer.Option(help="Algorithms, separated by commas; by default all that have the preset."),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Runs of each pair, with the seeds 0, 1, …")] = 3,
     steps: StepsOption = 1e6,
@@ -64,22 +62,24 @@ def benchmark(
         float, typer.Option(help="Steps between two checkpoints of a run.")
     ] = 5e4,
     jobs: JobsOption = None,
-    engine: Annotated[
+    executor: Annotated[
         str,
-        typer.Option(help="What runs them: local, processes of this machine, or ray, a cluster."),
+        typer.Option(
+            help="Where the runs are trained: local, on this machine, or ray, on a cluster."
+        ),
     ] = "local",
     address: Annotated[
         str | None,
         typer.Option(
-            help="Of the Ray cluster, host:port; by default RAY_ADDRESS, or this machine."
+            help="Address of the Ray cluster, host:port; by default RAY_ADDRESS, or this machine."
         ),
     ] = None,
     out_folder: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder of the grid; one that was cut off is gone on with."),
+        typer.Option("--out", help="Folder of the grid; an interrupted grid is resumed."),
     ] = None,
 ) -> None:
-    """Train every algorithm on every environment with every seed; may be killed and started again."""
+    """Train every algorithm on every environment with every seed; an interrupted grid is resumed."""
     with needs_agents():
         from gym_mara.agents.experiments.figures import plot_grid
         from gym_mara.agents.experiments.grid import Grid, open_grid, run_grid
@@ -93,17 +93,17 @@ def benchmark(
         backend=backend,
         checkpoint_every=whole("--checkpoint-every", checkpoint_every),
     )
-    runs_tasks = _engine(engine, jobs, address)
+    run_jobs = _executor(executor, jobs, address)
     folder = out_folder or Path("runs") / f"benchmark_{preset}"
     open_grid(folder, grid)
     with interruptible(
-        "Interrupted. What has finished is kept, and runs go on from their last checkpoint:\n"
-        "give the same command again"
+        "Interrupted. Finished runs are kept, the others resume from their last checkpoint:\n"
+        "run the same command again"
     ):
         view = _GridView(folder, grid)
         with Live(get_renderable=view.table, console=out, refresh_per_second=2) as live:
             view.notice = live.console.print
-            failed = run_grid(folder, grid, runs_tasks, view.hear)
+            failed = run_grid(folder, grid, run_jobs, view.on_message)
     for name, reason in failed.items():
         out.print(f"{name} failed: {reason}", style="red", markup=False, soft_wrap=True)
     if len(failed) < len(grid.runs()):
@@ -111,11 +111,12 @@ def benchmark(
             out.print(str(file), soft_wrap=True)
     if failed:
         raise GymMaraError(
-            f"{len(failed)} of {len(grid.runs())} runs failed; mend what stopped them and give the same command again"
+            f"{len(failed)} of {len(grid.runs())} runs failed; remove the cause and run the same command again"
         )
 
 
 def _algorithms(names: str | None, preset: str) -> tuple[str, ...]:
+    """The algorithms of a grid: those that are named, or else all that have the preset."""
     if names is not None:
         return tuple(name.strip() for name in names.split(","))
     if preset not in preset_names():
@@ -124,7 +125,7 @@ def _algorithms(names: str | None, preset: str) -> tuple[str, ...]:
 
 
 def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:
-    """Draw a benchmark's figures and write its tables."""
+    """Draw the figures of a benchmark and write its tables."""
     with needs_agents():
         from gym_mara.agents.experiments.figures import plot_grid
 
@@ -138,21 +139,22 @@ def search(
     algo: AlgoOption = DEFAULT_ALGORITHM,
     steps: StepsOption = 1e6,
     trials: Annotated[
-        int, typer.Option(help="How many trials in all, or a few more where several run at once.")
+        int,
+        typer.Option(help="How many trials in all; a few more if several run at the same time."),
     ] = 40,
     seeds: Annotated[int, typer.Option(help="How many runs make a trial.")] = 1,
     jobs: JobsOption = None,
     out_folder: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder of the search; one that was cut off is gone on with."),
+        typer.Option("--out", help="Folder of the search; an interrupted search is resumed."),
     ] = None,
 ) -> None:
-    """Search an algorithm's hyperparameters with Optuna, on seeds that no result is reported of."""
+    """Search an algorithm's hyperparameters with Optuna, on seeds that no reported result uses."""
     with needs_agents():
-        from gym_mara.agents.experiments import search as of
+        from gym_mara.agents.experiments import search as module
 
-    workers = _jobs(jobs)
-    wanted = of.Search(
+    processes = _processes(jobs)
+    wanted = module.Search(
         task_name(env),
         algo,
         whole("--steps", steps),
@@ -160,53 +162,53 @@ def search(
         whole("--seeds", seeds),
     )
     folder = out_folder or Path("runs") / f"search_{algo}_{wanted.env}"
-    study = of.open_study(wanted, folder)
+    study = module.open_study(wanted, folder)
 
     def show_best() -> None:
-        best = of.best(study)
-        told = f"best: {best.value:.3f} {json.dumps(best.params)}" if best else "none finished yet"
-        out.print(f"{of.finished(study)} of {trials} trials, {told}", soft_wrap=True)
+        best = module.best_trial(study)
+        text = f"best: {best.value:.3f} {json.dumps(best.params)}" if best else "none finished yet"
+        out.print(f"{module.finished_trials(study)} of {trials} trials, {text}", soft_wrap=True)
 
-    def hear(name: str, message: Any) -> None:
+    def on_message(name: str, message: Any) -> None:
         if message is not None:
             show_best()
 
-    with interruptible("Interrupted. Trials that have ended are kept: give the same command again"):
-        failed = of.run_search(wanted, folder, workers, hear)
+    with interruptible("Interrupted. Finished trials are kept: run the same command again"):
+        failed = module.run_search(wanted, folder, processes, on_message)
     if failed:
         raise GymMaraError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
     show_best()
 
 
-def _engine(name: str, jobs: int | None, address: str | None) -> Engine:
-    """What runs tasks, as the options have it."""
-    if name not in ENGINES:
-        raise unknown("engine", name, ENGINES)
+def _executor(name: str, jobs: int | None, address: str | None) -> Executor:
+    """The executor of this name, with the options that it takes."""
     if name == "local":
         if address is not None:
-            raise GymMaraError("--address is that of a Ray cluster: give --engine ray too")
-        from gym_mara.agents.experiments.local import run_tasks
+            raise GymMaraError("--address is for --executor ray only")
+        from gym_mara.agents.experiments.local_executor import run_in_processes
 
-        return partial(run_tasks, jobs=_jobs(jobs))
-    if jobs is not None:
-        raise GymMaraError("--jobs counts processes of this machine; a cluster uses all its cores")
-    from gym_mara.agents.experiments.ray import run_on_ray
+        return partial(run_in_processes, processes=_processes(jobs))
+    if name == "ray":
+        if jobs is not None:
+            raise GymMaraError("--jobs is for --executor local only; a cluster uses all its cores")
+        from gym_mara.agents.experiments.ray_executor import run_on_ray
 
-    return partial(run_on_ray, address=address)
+        return partial(run_on_ray, address=address)
+    raise unknown("executor", name, EXECUTORS)
 
 
-def _jobs(jobs: int | None) -> int:
+def _processes(jobs: int | None) -> int:
     return len(cores()) if jobs is None else whole_number("--jobs", jobs)
 
 
 class _GridView:
-    """The state of a grid's runs, as a table."""
+    """A table of the runs of a grid: their progress and their position errors."""
 
     def __init__(self, folder: Path, grid: Grid) -> None:
         from gym_mara.agents.experiments.grid import read_result
 
         self._grid = grid
-        self._began = time.monotonic()
+        self._started = time.monotonic()
         self._steps: dict[str, int] = {}
         self._shown: dict[str, dict[str, float]] = {}
         for name in grid.runs():
@@ -217,8 +219,8 @@ class _GridView:
         self._first: dict[str, int] = dict(self._steps)
         self.notice: Any = out.print
 
-    def hear(self, name: str, message: Any) -> None:
-        """Take up what a run says."""
+    def on_message(self, name: str, message: Any) -> None:
+        """Show a notice of a run, or keep its progress for the table."""
         if isinstance(message, str):
             self.notice(f"{name}: {message}", style="yellow", markup=False, soft_wrap=True)
         elif message is not None:
@@ -228,11 +230,11 @@ class _GridView:
             self._shown[name] = shown
 
     def table(self) -> Table:
-        """A cell for each pair of environment and algorithm: its runs' progress and position errors."""
+        """The table now: a cell for each pair of environment and algorithm."""
         total = self._grid.steps * len(self._grid.runs())
         done = sum(list(self._steps.values()))
         fresh = done - sum(min(first, self._grid.steps) for first in list(self._first.values()))
-        seconds = time.monotonic() - self._began
+        seconds = time.monotonic() - self._started
         left = (total - done) * seconds / fresh if fresh else None
         title = f"{done / total:.0%} of {len(self._grid.runs())} runs, {_clock(seconds)} so far"
         table = Table("", *(a.upper() for a in self._grid.algos), title=title)

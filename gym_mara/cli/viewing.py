@@ -1,4 +1,4 @@
-"""gym-mara watch and report: see what an agent does."""
+"""gym-mara watch and report: look at a policy."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
+    PolicyOption,
     SetOption,
     interruptible,
     keyword_arguments,
@@ -19,42 +20,41 @@ from gym_mara.cli.common import (
 )
 from gym_mara.errors import GymMaraError, positive_number
 
-PolicyOption = Annotated[
-    str, typer.Option(help="last, or best: the one that did best when evaluated.")
-]
-
 
 def watch(
     run: Annotated[
-        Path | None, typer.Argument(help="A run folder; without one, move the arm by hand.")
+        Path | None, typer.Argument(help="A run folder; without one, jog the joints.")
     ] = None,
     env: EnvOption = "MARA-v0",
     backend: Annotated[
         str | None,
         typer.Option(
-            help="Backend; by default the run's own. For a video several, with commas between them."
+            help="Backend; by default that of the run. A video may show several, separated by commas."
         ),
     ] = None,
     policy: PolicyOption = "last",
     video: Annotated[
-        Path | None, typer.Option(help="New file, .mp4 or .gif, instead of the browser.")
+        Path | None,
+        typer.Option(help="Write a new file, .mp4 or .gif, instead of opening the viewer."),
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="How much faster than real time; in the browser from 0.1 to 5.")
+        float, typer.Option(help="Times real time; the viewer allows 0.1 to 5.")
     ] = 1.0,
-    seconds: Annotated[float, typer.Option(help="How much of the episode a video shows, s.")] = 6.0,
+    seconds: Annotated[
+        float, typer.Option(help="Length of the episode that a video shows, s.")
+    ] = 6.0,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Watch a run's policy in the browser, or film it; without a run, move the arm by hand."""
+    """Watch a run's policy in the browser, or film it; without a run, jog the joints."""
     options = keyword_arguments(settings)
     positive_number("--speed", speed)
     positive_number("--seconds", seconds, "s")
     if run is None and video is not None:
-        raise GymMaraError("--video films a run's policy: name the run folder")
+        raise GymMaraError("--video films a run's policy: give a run folder")
     if run is None:
         from gym_mara.viewer import watch as open_viewer
 
-        # Who jogs the arm into the table wants to see it there, and not back at home.
+        # A user who jogs the arm into the table should see it there, not reset to its start.
         keywords = {"on_collision": "continue", **options}
         with interruptible("Closed."):
             open_viewer(task_name(env), backend or DEFAULT_BACKEND, keywords, speed=speed)
@@ -71,7 +71,9 @@ def watch(
         out.print(str(video), soft_wrap=True)
         return
     if len(backends) > 1:
-        raise GymMaraError("the browser shows one backend at a time, and can switch; name one")
+        raise GymMaraError(
+            "the viewer shows one backend at a time, and can switch: give one --backend"
+        )
     with interruptible("Closed."):
         watch_run(folder, backends[0], options, policy, speed)
 
@@ -84,7 +86,7 @@ def report(
         typer.Option("--out", help="The page; by default report.html in the run folder."),
     ] = None,
 ) -> None:
-    """Write a page about a run: curves, an episode on every backend, the tool's path, a video, the configuration."""
+    """Write an HTML page about a run: curves, an episode on every backend, the tool's path, a video, the configuration."""
     with needs_agents():
         from gym_mara.agents.inspection.report import write_report
         from gym_mara.agents.runs.folder import RunFolder

@@ -1,4 +1,4 @@
-"""A small training that several tests look at."""
+"""A small training that several tests use."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train, use_one_thread
 
 ROLLOUT = 256 * 2
-"""Steps between two updates of the preset."""
+"""Steps between two updates of PPO's tuned preset."""
 
 
 def config(**changes: object) -> RunConfig:
-    """A run of three updates with a checkpoint after each."""
+    """A run of three updates, with a checkpoint after each."""
     values: dict[str, object] = {
         "env": "MARACollisionOrient-v0",
         "algo": "ppo",
@@ -27,16 +27,16 @@ def config(**changes: object) -> RunConfig:
 
 
 def silent(steps: int, shown: dict[str, float]) -> None:
-    """No progress is reported."""
+    """Ignore the progress."""
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
-    """Tests run in several processes, which share the cores."""
+    """Test processes share the cores."""
     use_one_thread()
 
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A run that was trained to its end; tests must not change it."""
+    """A finished run; tests must not change it."""
     return train(config(), Path(tmp_path_factory.mktemp("runs")) / "run", silent)

@@ -1,9 +1,8 @@
-"""A search for hyperparameters with Optuna, on seeds that no reported result uses."""
+"""A search for hyperparameters with Optuna. It trains on seeds that no reported result uses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,8 @@ from optuna.storages.journal import JournalFileBackend
 
 from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, is_schedule
 from gym_mara.agents.algorithms.registry import algorithm
-from gym_mara.agents.experiments.local import Say, run_tasks
+from gym_mara.agents.experiments.executor import OnMessage, Send
+from gym_mara.agents.experiments.local_executor import run_in_processes
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
@@ -27,15 +27,14 @@ from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
-"""Trials train on seeds from here on; results are reported of seeds from 0 on."""
-
+"""Trials train on seeds from here on; reported results use seeds from 0 on."""
 _EVALUATIONS = 10
-"""How often a run is evaluated, and may be given up."""
+"""How often a run is evaluated; after each evaluation its trial may be pruned."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched for: the tuned preset of an algorithm on an environment."""
+    """What to search: the hyperparameters of an algorithm on an environment, starting from the default preset."""
 
     env: str
     algo: str
@@ -53,13 +52,15 @@ class Search:
 
 
 def open_study(search: Search, folder: Path) -> optuna.Study:
-    """The search in a folder, new or as far as it has come.
+    """The study of a search in its folder, new or with the trials so far.
 
     Raises:
-        GymMaraError: the folder holds another search.
+        GymMaraError: a name is unknown, or the folder holds another search.
     """
     start = preset_of(search.config(FIRST_SEED))
-    folder = folder.resolve()  # Optuna's lock is a link, which a relative path would leave dangling
+    folder = (
+        folder.resolve()
+    )  # Optuna's lock is a symbolic link, and a relative path would break it
     folder.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name="search",
@@ -68,32 +69,34 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=_EVALUATIONS // 3),
         load_if_exists=True,
     )
-    about = {name: value for name, value in asdict(search).items() if name != "trials"}
-    there = study.user_attrs.get("search")
-    if there is None:
+    wanted = {name: value for name, value in asdict(search).items() if name != "trials"}
+    existing = study.user_attrs.get("search")
+    if existing is None:
         study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
-        study.set_user_attr("search", about)
-    elif there != about:
-        raise GymMaraError(f"{str(folder)!r} holds another search: {there}")
+        study.set_user_attr("search", wanted)
+    elif existing != wanted:
+        raise GymMaraError(
+            f"{str(folder)!r} holds another search, {existing}: choose another --out"
+        )
     return study
 
 
 def run_search(
-    search: Search, folder: Path, jobs: int, hear: Callable[[str, Any], None]
+    search: Search, folder: Path, processes: int, on_message: OnMessage
 ) -> dict[str, str]:
-    """Search with so many processes; trials that a kill cut off before are tried again.
+    """Run the trials of a search in several processes; trials that a kill interrupted earlier are repeated.
 
     Args:
-        search: what for.
+        search: what to search.
         folder: of the search.
-        jobs: how many processes.
-        hear: called with a process's name and how many trials have ended, or None as a trial goes on.
+        processes: how many run trials at a time.
+        on_message: called with a process's name and the number of finished trials, or None while a trial goes on.
 
     Returns:
-        Process → what went wrong, of those that failed.
+        Name of the process → reason, for each that failed.
 
     Raises:
-        GymMaraError: the folder holds another search, or another process searches there.
+        GymMaraError: the folder holds another search, or another command searches there.
     """
     study = open_study(search, folder)
     try:
@@ -101,51 +104,48 @@ def run_search(
             for trial in study.get_trials(deepcopy=False, states=(_State.RUNNING,)):
                 study.tell(trial.number, state=_State.FAIL)
                 study.enqueue_trial({**trial.system_attrs.get("fixed_params", {}), **trial.params})
-            tasks = {f"worker {i}": partial(work, search, folder) for i in range(jobs)}
-            return run_tasks(tasks, hear, jobs)
+            job = partial(run_trials, search, folder)
+            jobs = {f"worker {number}": job for number in range(processes)}
+            return run_in_processes(jobs, on_message, processes)
     except Timeout:
-        raise GymMaraError(f"another process is searching in {str(folder)!r}") from None
+        raise GymMaraError(
+            f"another process is searching in {str(folder)!r}: wait for it, or choose another --out"
+        ) from None
 
 
-def work(search: Search, folder: Path, say: Say) -> None:
-    """Try hyperparameters until the search has as many finished trials as it wants; several processes may."""
+def run_trials(search: Search, folder: Path, send: Send) -> None:
+    """Run trials until the search has as many finished ones as it wants; several processes may do so."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = open_study(search, folder)
-    while finished(study) < search.trials:
-        study.optimize(partial(_value, search, say), n_trials=1)
-        say(finished(study))
+    while finished_trials(study) < search.trials:
+        study.optimize(partial(_value, search, send), n_trials=1)
+        send(finished_trials(study))
 
 
-def finished(study: optuna.Study) -> int:
-    """How many trials have ended, those that were given up early or diverged among them, but not those that a kill ended."""
+def finished_trials(study: optuna.Study) -> int:
+    """How many trials have finished, including those that were pruned or diverged, but not those that were killed."""
     return len(study.get_trials(deepcopy=False, states=(_State.COMPLETE, _State.PRUNED)))
 
 
-def best(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
-    """The best trial that went to its end, if there is one."""
+def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
+    """The best of the trials that were not pruned, if there is one."""
     done = study.get_trials(deepcopy=False, states=(_State.COMPLETE,))
     return min(done, key=lambda trial: trial.value or 0.0, default=None)
 
 
-def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
-    """What a trial is worth, the smaller the better: log₁₀ of what its last policies' reward per step falls short of 10."""
-    space = algorithm(search.algo).search_space
-    chosen = {
-        name: trial.suggest_float(name, *values, log=True)
-        if isinstance(values, LogRange)
-        else trial.suggest_categorical(name, values)
-        for name, values in {**space.arguments, **space.policy_kwargs}.items()
-    }
-    preset = with_values(preset_of(search.config(FIRST_SEED)), space, chosen)
-    values: list[float] = []
-    told: list[int] = [0]
+def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
+    """Train the runs of a trial; the mean shortfall of their last policies."""
+    preset = _suggested(search, trial)
+    shortfalls: list[float] = []
+    reported = 0
 
-    def report(_: int, shown: dict[str, float]) -> None:
-        say(None)
-        # By their number: the steps at which trials are evaluated hang on their rollouts.
+    def on_progress(_: int, shown: dict[str, float]) -> None:
+        nonlocal reported
+        send(None)
+        # Trials are compared by the number of the evaluation, because its step depends on the length of a rollout.
         number = int(shown.get("evaluations", 0))
-        if number > told[0] and not values:  # the first run decides
-            told[0] = number
+        if number > reported and not shortfalls:  # only the first run of a trial may prune it
+            reported = number
             trial.report(_shortfall(shown["eval_reward_per_step"]), number)
             if trial.should_prune():
                 raise optuna.TrialPruned
@@ -154,16 +154,28 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
         config = search.config(FIRST_SEED + 1000 * trial.number + seed)
         with TemporaryDirectory() as folder:
             try:
-                run = train(config, Path(folder) / "run", report, preset=preset)
+                run = train(config, Path(folder) / "run", on_progress, preset=preset)
             except TrainingDivergedError as error:
                 raise optuna.TrialPruned(str(error)) from error
             reward = float(evaluate_run(run, episodes=1)["reward_per_step"].mean())
-        values.append(_shortfall(reward))
-    return float(np.mean(values))
+        shortfalls.append(_shortfall(reward))
+    return float(np.mean(shortfalls))
+
+
+def _suggested(search: Search, trial: optuna.Trial) -> Preset:
+    """The preset of a trial, with the values that the sampler suggests."""
+    space = algorithm(search.algo).search_space
+    chosen = {
+        name: trial.suggest_float(name, *values, log=True)
+        if isinstance(values, LogRange)
+        else trial.suggest_categorical(name, values)
+        for name, values in {**space.arguments, **space.policy_kwargs}.items()
+    }
+    return with_values(preset_of(search.config(FIRST_SEED)), space, chosen)
 
 
 def with_values(preset: Preset, space: SearchSpace, chosen: dict[str, Any]) -> Preset:
-    """A preset with other values of what a search varies; a schedule is scaled so that it starts at its value."""
+    """A preset with the values of a trial; a schedule is scaled so that it starts at its value."""
     arguments = dict(preset.arguments)
     for name, value in chosen.items():
         if name in space.policy_kwargs:
@@ -176,7 +188,7 @@ def with_values(preset: Preset, space: SearchSpace, chosen: dict[str, Any]) -> P
 
 
 def values_of(preset: Preset, space: SearchSpace) -> dict[str, Any]:
-    """The values that a preset has of what a search varies; of a schedule its first."""
+    """The values that a preset has for the hyperparameters of a search space; for a schedule its first value."""
     given = {**preset.arguments, **preset.arguments.get("policy_kwargs", {})}
     found = {
         name: given[name] for name in (*space.arguments, *space.policy_kwargs) if name in given
@@ -185,4 +197,5 @@ def values_of(preset: Preset, space: SearchSpace) -> dict[str, Any]:
 
 
 def _shortfall(reward_per_step: float) -> float:
+    """log₁₀ of how far a reward per step is below 10, the highest; a search minimises it."""
     return math.log10(max(10.0 - reward_per_step, 1e-9))

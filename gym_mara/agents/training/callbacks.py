@@ -1,4 +1,4 @@
-"""What happens around the updates of a training: checkpoints, evaluation, a bar of progress."""
+"""The callback of a training: checkpoints, evaluations, logging and progress."""
 
 from __future__ import annotations
 
@@ -19,28 +19,31 @@ from gym_mara.agents.runs.policy import normalisation, save_policy
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.training.learning_curve import plot_learning_curve
 
-Report = Callable[[int, dict[str, float]], None]
+OnProgress = Callable[[int, dict[str, float]], None]
+"""Called with the number of steps so far and the values to show."""
 
 
-class Keeper(BaseCallback):
-    """Writes checkpoints, evaluates the deterministic policy, keeps the best, and logs the training reward.
+class CheckpointCallback(BaseCallback):
+    """Writes checkpoints, evaluates the deterministic policy, saves the best one, and logs the training reward.
 
-    All of it happens between two updates, where environment, policy and random generators are at rest together: a run
-    that goes on from a checkpoint goes on exactly as it would have.
+    All this happens before a rollout starts, when neither environment nor policy is in the middle of something. A run
+    resumed from a checkpoint therefore gives the same result, to the bit, as one that was never interrupted.
 
     Args:
-        run: where to write.
+        run: the folder to write to.
         best: the best evaluation so far, as reward per step.
         elapsed: how long the run has trained before, s.
-        report: called after every update with the number of steps and what to show.
+        on_progress: called after every rollout.
     """
 
-    def __init__(self, run: RunFolder, best: float, elapsed: float, report: Report) -> None:
+    def __init__(
+        self, run: RunFolder, best: float, elapsed: float, on_progress: OnProgress
+    ) -> None:
         super().__init__()
         self.run = run
         self.best = best
-        self._began = time.monotonic() - elapsed
-        self.report = report
+        self._started = time.monotonic() - elapsed
+        self.on_progress = on_progress
         self.shown: dict[str, float] = {}
         self._next = 0
         self._eval_env: MaraVecEnv | None = None
@@ -51,7 +54,7 @@ class Keeper(BaseCallback):
         self._eval_env = make_env(config.env, config.backend, 1, config.env_options)
 
     def _on_rollout_start(self) -> None:
-        # The model's own count: the callback's is set later in the rollout.
+        # The model's own count: Stable-Baselines3 updates the callback's only during the rollout.
         if self.model.num_timesteps >= self._next:
             self._next = self.model.num_timesteps + self.run.config.checkpoint_every
             self.checkpoint()
@@ -66,28 +69,28 @@ class Keeper(BaseCallback):
         self.shown["reward_per_step"] = env.reward_sum / steps
         env.reward_sum = 0.0
         self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
-        self.report(self.model.num_timesteps, self.shown)
+        self.on_progress(self.model.num_timesteps, self.shown)
 
     def _on_training_end(self) -> None:
         self.checkpoint()
         plot_learning_curve(self.run)
-        # What makes the run a finished one comes last.
+        # This marks the run as finished, so it comes last.
         save_policy(self.run.path / "last", self.model)  # type: ignore[arg-type]
 
     def close(self) -> None:
-        """Free the environment of the evaluations."""
+        """Close the environment of the evaluations."""
         if self._eval_env is not None:
             self._eval_env.close()
 
     def checkpoint(self) -> None:
-        """Evaluate, keep the policy if it is the best so far, and write a checkpoint."""
+        """Evaluate, save the policy if it is the best so far, and write a checkpoint."""
         model: Any = self.model
         steps = model.num_timesteps
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[f"eval_{name}"] = value
         self.shown["evaluations"] = self.shown.get("evaluations", 0) + 1
-        elapsed = time.monotonic() - self._began
+        elapsed = time.monotonic() - self._started
         self.logger.record("time/total_timesteps", steps)
         self.logger.record("time/time_elapsed", round(elapsed, 1))
         self.logger.dump(steps)
@@ -116,17 +119,17 @@ class Keeper(BaseCallback):
         )
         if trained.norm_obs:
             env.obs_rms = trained.obs_rms
-        env.seed(self.run.config.seed)  # the same episodes each time, where they are random
+        env.seed(self.run.config.seed)  # random episodes are the same in every evaluation
         return {name: float(values.mean()) for name, values in play(self.model, env).items()}
 
 
 def random_state() -> tuple[Any, ...]:
-    """The state of every random generator that Stable-Baselines3 draws from."""
+    """The state of every random generator that Stable-Baselines3 uses."""
     return random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
 
 
 def restore_random_state(state: tuple[Any, ...]) -> None:
-    """Go back to what `random_state` returned."""
+    """Set the random generators to a state from `random_state`."""
     python_state, numpy_state, torch_state = state
     random.setstate(python_state)
     np.random.set_state(numpy_state)  # noqa: NPY002
@@ -134,7 +137,7 @@ def restore_random_state(state: tuple[Any, ...]) -> None:
 
 
 def base_env(model: Any) -> MaraVecEnv:
-    """The environment under a model's normalisation."""
+    """The environment inside a model's normalisation."""
     env = normalisation(model).venv
     assert isinstance(env, MaraVecEnv)
     return env

@@ -1,4 +1,4 @@
-"""Training an agent: from a configuration to a finished run folder, or on from where a run was cut off."""
+"""Trains an agent into a run folder, or resumes an interrupted run."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.agents.runs.policy import load_model, policy_arguments
 from gym_mara.agents.training.callbacks import (
-    Keeper,
-    Report,
+    CheckpointCallback,
+    OnProgress,
     base_env,
     restore_random_state,
 )
@@ -39,19 +39,19 @@ from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 
 def train(
-    config: RunConfig, out: Path, report: Report, *, preset: Preset | None = None
+    config: RunConfig, out: Path, on_progress: OnProgress, *, preset: Preset | None = None
 ) -> RunFolder:
     """Train an agent into a new run folder.
 
     Args:
         config: what to train.
         out: the folder.
-        report: called after every update.
-        preset: hyperparameters in place of the preset that the configuration names.
+        on_progress: called after every rollout.
+        preset: hyperparameters to use instead of the preset that the configuration names.
 
     Raises:
-        GymMaraError: a name is unknown, a value out of range, or the folder exists.
-        TrainingDivergedError: the agent's numbers are no longer finite.
+        GymMaraError: a name is unknown, a value is out of range, or the folder exists.
+        TrainingDivergedError: the agent's parameters are no longer finite.
     """
     for name in ("steps", "checkpoint_every"):
         if getattr(config, name) < 1:
@@ -61,14 +61,14 @@ def train(
     algorithm(config.algo)  # an unknown name is an error before anything is built
     preset = preset or preset_of(config)
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
-    model = new_model(config)  # before the folder: what cannot be built leaves none behind
+    model = new_model(config)  # if this fails, no folder is made
     run = RunFolder.create(out, config)
-    with _alone(run):
-        return _learn(run, model, report=report)
+    with _locked(run):
+        return _learn(run, model, on_progress)
 
 
 def preset_of(config: RunConfig) -> Preset:
-    """The preset that a configuration names, for joints that teleport or travel as in its environment.
+    """The preset that a configuration names, for joints that teleport or travel as they do in its environment.
 
     Raises:
         GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
@@ -82,30 +82,30 @@ def preset_of(config: RunConfig) -> Preset:
     return pair.teleporting if teleports else pair.travelling
 
 
-def resume(path: Path, report: Report) -> RunFolder:
-    """Go on with a run from its last checkpoint, as if it had never been cut off.
+def resume(path: Path, on_progress: OnProgress) -> RunFolder:
+    """Resume a run from its last checkpoint. The result is the same as without the interruption.
 
     Raises:
-        GymMaraError: it is no run folder, it is damaged, it has finished, or another process trains it.
-        TrainingDivergedError: the agent's numbers are no longer finite.
+        GymMaraError: the folder holds no run, the run is damaged or has finished, or another process trains it.
+        TrainingDivergedError: the agent's parameters are no longer finite.
     """
     run = RunFolder.open(path)
-    with _alone(run):
-        return _go_on(run, report)
+    with _locked(run):
+        return _resume(run, on_progress)
 
 
-def _go_on(run: RunFolder, report: Report) -> RunFolder:
+def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
     config = run.config
     checkpoints = run.checkpoints()
     if not checkpoints:
-        return _learn(run, new_model(config), report=report)
+        return _learn(run, new_model(config), on_progress)
     use_one_thread()
     preset = Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     model, wrapped = load_model(checkpoints[-1], config.algo, env)
     if model.num_timesteps >= config.steps and run.has_policy("last"):
         raise GymMaraError(
-            f"the run {str(run.path)!r} has finished its {config.steps} steps; for more begin a new one"
+            f"the run {str(run.path)!r} has finished its {config.steps} steps; start a new run to train longer"
         )
     try:
         state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
@@ -113,16 +113,16 @@ def _go_on(run: RunFolder, report: Report) -> RunFolder:
         wrapped.returns = state["returns"]
         restore_random_state(state["random"])
         best, elapsed = float(state["best"]), float(state["elapsed"])
-    except Exception as error:  # a damaged pickle raises anything
+    except Exception as error:  # a damaged pickle may raise any exception
         raise DamagedRunError(
-            f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to go on from the one before"
+            f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to resume from the one before"
         ) from error
-    return _learn(run, model, report=report, best=best, elapsed=elapsed)
+    return _learn(run, model, on_progress, best=best, elapsed=elapsed)
 
 
 @contextmanager
-def _alone(run: RunFolder) -> Iterator[None]:
-    """Keep a run to this process; the system frees it when the process is killed.
+def _locked(run: RunFolder) -> Iterator[None]:
+    """Lock a run for this process; the operating system releases the lock if the process is killed.
 
     Raises:
         GymMaraError: another process trains it.
@@ -139,14 +139,14 @@ def _alone(run: RunFolder) -> Iterator[None]:
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
-    """An untrained agent, with its environment, as a configuration asks for it."""
+    """An untrained agent and its environment, from a configuration."""
     preset = Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     return new_agent(config.algo, preset, env, config.seed)
 
 
 def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
-    """An untrained agent of an algorithm and a preset on any environment of Stable-Baselines3."""
+    """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3."""
     use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
@@ -158,18 +158,18 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
 
 
 def use_one_thread() -> None:
-    """Keep torch to one thread: for networks this small more cost time, and change the last bits of the result."""
+    """Limit torch to one thread: for such small networks more threads are slower, and they change the last bits of results."""
     torch.set_num_threads(1)
 
 
 class PiecewiseLinear:
-    """A value that changes linearly between points, (progress from 0 to 1, value); a class, as a model on disk needs it."""
+    """A value that changes linearly between points (progress from 0 to 1, value); a class, because a model on disk needs one."""
 
     def __init__(self, points: Sequence[Sequence[float]]) -> None:
         self._progress, self._values = zip(*points, strict=True)
 
     def __call__(self, progress_remaining: float) -> float:
-        """The value at a progress as Stable-Baselines3 counts it, from 1 down to 0; its last beyond that."""
+        """The value at the remaining progress, which Stable-Baselines3 counts from 1 down to 0."""
         return float(np.interp(1.0 - progress_remaining, self._progress, self._values))
 
 
@@ -181,18 +181,18 @@ def _schedule(value: Any) -> Any:
 def _learn(
     run: RunFolder,
     model: OnPolicyAlgorithm,
+    on_progress: OnProgress,
     *,
-    report: Report,
     best: float = -np.inf,
     elapsed: float = 0.0,
 ) -> RunFolder:
-    keeper = Keeper(run, best, elapsed, report)
+    callback = CheckpointCallback(run, best, elapsed, on_progress)
     try:
         model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
         try:
-            report(model.num_timesteps, {})
+            on_progress(model.num_timesteps, {})
             left = run.config.steps - model.num_timesteps
-            model.learn(left, callback=keeper, reset_num_timesteps=False)
+            model.learn(left, callback=callback, reset_num_timesteps=False)
         finally:
             model.logger.close()
     except TrainingDivergedError:
@@ -201,17 +201,17 @@ def _learn(
         if isinstance(error, ValueError) and _is_finite(model):
             raise
         raise TrainingDivergedError(
-            f"the training diverged: its numbers are no longer finite ({error}); "
+            f"the training diverged: its parameters are no longer finite ({error}); "
             "try a smaller learning rate or trust region"
         ) from error
-    finally:  # an interrupt among the ways out
-        keeper.close()
+    finally:  # also after an interrupt
+        callback.close()
         base_env(model).close()
     return run
 
 
 def _is_finite(model: OnPolicyAlgorithm) -> bool:
-    """Whether a model's parameters are finite, and so are the standard deviations and their inverses."""
+    """Whether a model's parameters, its standard deviations and their inverses are finite."""
     numbers: list[torch.Tensor] = list(model.policy.parameters())
     if hasattr(model.policy, "log_std"):
         numbers += [model.policy.log_std.exp(), (-model.policy.log_std).exp()]
@@ -219,8 +219,8 @@ def _is_finite(model: OnPolicyAlgorithm) -> bool:
 
 
 def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
-    """The table and the TensorBoard log, without what a run that was cut off wrote after its last checkpoint."""
-    kept = run.path / "progress.csv.kept"  # until the new table has what the old one had
+    """The table and the TensorBoard log; a resumed run drops what it wrote there after its last checkpoint."""
+    kept = run.path / "progress.csv.kept"  # the old table, until its rows are in the new one
     if run.progress_file.is_file() and not kept.is_file():
         os.replace(run.progress_file, kept)
     rows = read_progress(kept) if kept.is_file() else []

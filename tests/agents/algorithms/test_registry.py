@@ -31,7 +31,7 @@ from gym_mara.agents.algorithms.registry import (
 )
 from gym_mara.agents.experiments.figures import plot_grid
 from gym_mara.agents.experiments.grid import Grid, open_grid, run_one
-from gym_mara.agents.experiments.search import Search, best, open_study, work
+from gym_mara.agents.experiments.search import Search, best_trial, open_study, run_trials
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train
@@ -150,12 +150,12 @@ def test_a_registered_algorithm_has_its_place_in_a_grid(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("a2c")
 def test_a_registered_algorithm_is_searched(tmp_path: Path) -> None:
     search = Search(env="MARA-v0", algo="a2c", steps=128, trials=2, seeds=1)
-    work(search, tmp_path, ignore)
+    run_trials(search, tmp_path, ignore)
     study = open_study(search, tmp_path)
     first = study.trials[0].params
     assert first.keys() == {"n_steps", "learning_rate", "log_std_init"}
     assert (first["n_steps"], first["learning_rate"]) == (4, 1e-3)
-    assert best(study) is not None
+    assert best_trial(study) is not None
 
 
 def test_the_registry_and_the_command_line_import_no_torch() -> None:

@@ -1,4 +1,4 @@
-"""The grid of runs: it finishes what was begun, keeps what has finished, and sets aside what is damaged."""
+"""The grid of runs: it resumes interrupted runs, keeps finished ones, and trains damaged ones again."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ import pytest
 from filelock import FileLock
 
 from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
-from gym_mara.agents.experiments import grid as benchmark
+from gym_mara.agents.experiments import grid as grid_module
+from gym_mara.agents.experiments.executor import Executor, Send
 from gym_mara.agents.experiments.figures import format_interval, interquartile_mean, plot_grid
 from gym_mara.agents.experiments.grid import Grid, open_grid, read_result, run_grid
-from gym_mara.agents.experiments.local import Engine, Say, run_tasks
+from gym_mara.agents.experiments.local_executor import run_in_processes
 from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
 from tests.helpers import started
@@ -33,24 +34,24 @@ from tests.helpers import started
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
 
 
-def deaf(name: str, message: Any) -> None:
-    """What the runs say is not heard."""
+def ignore(name: str, message: Any) -> None:
+    """Messages go nowhere."""
 
 
-def processes(jobs: int) -> Engine:
-    """So many processes of this machine."""
-    return partial(run_tasks, jobs=jobs)
+def processes(number: int) -> Executor:
+    """An executor with this many local processes."""
+    return partial(run_in_processes, processes=number)
 
 
 @pytest.fixture(scope="session")
 def finished_grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A grid that was trained to its end; tests must not change it."""
     folder = Path(tmp_path_factory.mktemp("grids")) / "grid"
-    assert run_grid(folder, GRID, processes(2), deaf) == {}
+    assert run_grid(folder, GRID, processes(2), ignore) == {}
     return folder
 
 
-def test_every_run_leaves_its_result(finished_grid: Path) -> None:
+def test_every_run_writes_its_result(finished_grid: Path) -> None:
     assert set(GRID.runs()) == {f"MARA-v0_{algo}_0" for algo in GRID.algos}
     for name in GRID.runs():
         result = read_result(finished_grid / name)
@@ -59,15 +60,18 @@ def test_every_run_leaves_its_result(finished_grid: Path) -> None:
         assert result["seconds"] > 0.0
 
 
-def test_what_has_finished_is_not_trained_again(finished_grid: Path) -> None:
-    said: list[str] = []
+def test_finished_runs_are_not_trained_again(finished_grid: Path) -> None:
+    senders: list[str] = []
     assert (
-        run_grid(finished_grid, GRID, processes(1), lambda name, message: said.append(name)) == {}
+        run_grid(finished_grid, GRID, processes(1), lambda name, message: senders.append(name))
+        == {}
     )
-    assert not any(said)
+    assert not senders
 
 
-def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_path: Path) -> None:
+def test_a_killed_grid_is_resumed_with_the_same_results(
+    finished_grid: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "grid"
     options = ["--envs", "MARA-v0", "--algos", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
     command = ["-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
@@ -78,7 +82,7 @@ def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_p
             assert process.poll() is None, "the grid ended early"
             assert time.monotonic() < deadline
             time.sleep(0.01)
-    assert run_grid(folder, GRID, processes(2), deaf) == {}
+    assert run_grid(folder, GRID, processes(2), ignore) == {}
     for name in GRID.runs():
         mine, theirs = read_result(folder / name), read_result(finished_grid / name)
         assert mine is not None
@@ -87,7 +91,7 @@ def test_a_grid_that_is_killed_goes_on_and_ends_alike(finished_grid: Path, tmp_p
 
 
 @pytest.mark.parametrize("victim", ["config.json", "last/model.zip", "progress.csv"])
-def test_a_damaged_run_is_named_set_aside_and_run_again(
+def test_a_damaged_run_is_renamed_and_trained_again(
     finished_grid: Path, tmp_path: Path, victim: str
 ) -> None:
     folder, name = tmp_path / "grid", "MARA-v0_acktr_0"
@@ -95,11 +99,9 @@ def test_a_damaged_run_is_named_set_aside_and_run_again(
     before = read_result(folder / name)
     (folder / name / "result.json").unlink()
     (folder / name / victim).write_bytes(b"\x00 no such thing")
-    said: list[Any] = []
-    assert (
-        run_grid(folder, GRID, processes(1), lambda who, message: said.append((who, message))) == {}
-    )
-    assert any(who == name and "set aside" in str(message) for who, message in said)
+    messages: list[Any] = []
+    assert run_grid(folder, GRID, processes(1), lambda *sent: messages.append(sent)) == {}
+    assert any(who == name and "renamed" in str(message) for who, message in messages)
     assert (folder / f"{name}.damaged1").is_dir()
     after = read_result(folder / name)
     assert before is not None
@@ -107,18 +109,18 @@ def test_a_damaged_run_is_named_set_aside_and_run_again(
     assert after["last"] == before["last"]
 
 
-def test_without_room_to_write_runs_fail_and_can_be_gone_on_with(
-    finished_grid: Path, tmp_path: Path
-) -> None:
+def test_runs_that_failed_on_a_full_disk_are_resumed(finished_grid: Path, tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))  # of any file, as on a full disk
-        failed = run_grid(tmp_path / "grid", GRID, processes(2), deaf)
+        resource.setrlimit(
+            resource.RLIMIT_FSIZE, (20_000, hard)
+        )  # for every file, as on a full disk
+        failed = run_grid(tmp_path / "grid", GRID, processes(2), ignore)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert failed.keys() == GRID.runs().keys()
     assert all("File too large" in reason for reason in failed.values())
-    assert run_grid(tmp_path / "grid", GRID, processes(2), deaf) == {}
+    assert run_grid(tmp_path / "grid", GRID, processes(2), ignore) == {}
     for name in GRID.runs():
         mine, theirs = read_result(tmp_path / "grid" / name), read_result(finished_grid / name)
         assert mine is not None
@@ -126,20 +128,22 @@ def test_without_room_to_write_runs_fail_and_can_be_gone_on_with(
         assert mine["last"] == theirs["last"]
 
 
-def test_a_run_that_another_process_trains_is_left_to_it(
+def test_a_run_that_another_process_holds_is_not_trained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(benchmark, "PATIENCE", 0.1)
+    monkeypatch.setattr(grid_module, "PATIENCE", 0.1)
     name, config = next(iter(GRID.runs().items()))
     with (
         FileLock(tmp_path / f".{name}.lock"),
         pytest.raises(GymMaraError, match="another process is training"),
     ):
-        benchmark.run_one(tmp_path / name, config, print)
+        grid_module.run_one(tmp_path / name, config, print)
     assert not (tmp_path / name).exists()
 
 
-def test_a_run_that_is_trained_by_itself_is_left_alone(finished_grid: Path, tmp_path: Path) -> None:
+def test_a_run_that_gym_mara_train_holds_is_not_trained(
+    finished_grid: Path, tmp_path: Path
+) -> None:
     name, config = next(iter(GRID.runs().items()))
     path = shutil.copytree(finished_grid / name, tmp_path / name)
     shutil.rmtree(path / "last")
@@ -148,13 +152,13 @@ def test_a_run_that_is_trained_by_itself_is_left_alone(finished_grid: Path, tmp_
         FileLock(path / ".lock"),
         pytest.raises(GymMaraError, match="another process is training"),
     ):
-        benchmark.run_one(path, config, print)
+        grid_module.run_one(path, config, print)
     assert not list(tmp_path.glob("*damaged*"))
-    benchmark.run_one(path, config, print)
+    grid_module.run_one(path, config, print)
     assert read_result(path) is not None
 
 
-def test_the_folder_of_another_grid_is_refused(
+def test_a_folder_with_another_grid_is_refused(
     finished_grid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(GymMaraError, match=r"another grid .*steps 4096 there, 8192 now"):
@@ -162,34 +166,32 @@ def test_the_folder_of_another_grid_is_refused(
     ppo = algorithm("ppo")
     changed = replace(ppo, presets={"tuned": ppo.presets["paper"]})
     monkeypatch.setitem(ALGORITHMS, "ppo", changed)
-    with pytest.raises(GymMaraError, match="made with other 'tuned' presets"):
+    with pytest.raises(GymMaraError, match="the 'tuned' presets have changed"):
         open_grid(finished_grid, GRID)
     (tmp_path / "something").touch()
-    with pytest.raises(GymMaraError, match="neither empty nor a grid"):
+    with pytest.raises(GymMaraError, match="holds files but no grid"):
         open_grid(tmp_path, GRID)
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "message"),
     [
         ({"envs": ("MARA-v1",)}, "environment"),
         ({"algos": ("ppo2",)}, "algorithm"),
         ({"preset_name": "papers"}, "preset"),
-        ({"envs": ("MARA-v0", "MARA-v0")}, "name each once"),
-        ({"algos": ("ppo", "ppo")}, "name each once"),
+        ({"envs": ("MARA-v0", "MARA-v0")}, "give each name once"),
+        ({"algos": ("ppo", "ppo")}, "give each name once"),
         ({"seeds": 0}, "seeds"),
         ({"steps": -1}, "steps"),
     ],
 )
-def test_a_grid_of_nonsense_is_refused(
-    tmp_path: Path, change: dict[str, Any], complaint: str
-) -> None:
-    with pytest.raises(GymMaraError, match=complaint):
+def test_a_wrong_grid_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
         open_grid(tmp_path / "grid", replace(GRID, **change))
     assert not (tmp_path / "grid").exists()
 
 
-def test_figures_and_tables_show_every_run(finished_grid: Path, tmp_path: Path) -> None:
+def test_figures_and_tables_contain_every_run(finished_grid: Path, tmp_path: Path) -> None:
     finished_grid = shutil.copytree(finished_grid, tmp_path / "grid")
     files = plot_grid(finished_grid)
     assert {file.name for file in files} == {
@@ -208,7 +210,9 @@ def test_figures_and_tables_show_every_run(finished_grid: Path, tmp_path: Path) 
     assert "| MARA-v0 | ACKTR | 1 |" in text
 
 
-def test_a_finished_run_that_is_damaged_later_is_named(finished_grid: Path, tmp_path: Path) -> None:
+def test_a_finished_run_that_was_damaged_later_is_reported(
+    finished_grid: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
@@ -216,9 +220,7 @@ def test_a_finished_run_that_is_damaged_later_is_named(finished_grid: Path, tmp_
         plot_grid(folder)
 
 
-def test_what_has_not_finished_is_left_out_of_the_figures(
-    finished_grid: Path, tmp_path: Path
-) -> None:
+def test_unfinished_runs_are_left_out_of_the_figures(finished_grid: Path, tmp_path: Path) -> None:
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_acktr_0" / "result.json").unlink()
@@ -227,7 +229,7 @@ def test_what_has_not_finished_is_left_out_of_the_figures(
 
 
 def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:
-    with pytest.raises(GymMaraError, match=r"no grid\.json"):
+    with pytest.raises(GymMaraError, match=r"there is no grid\.json"):
         plot_grid(tmp_path)
     open_grid(tmp_path / "grid", GRID)
     with pytest.raises(GymMaraError, match="no run of the grid"):
@@ -243,94 +245,96 @@ def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
     assert format_interval(interquartile_mean([1.0, np.inf, np.inf]), 1) == "-"
 
 
-def _dies(say: Say) -> None:
-    say("alive")
+def _die(send: Send) -> None:
+    send("alive")
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _speaks(say: Say) -> None:
-    say("hello")
+def _greet(send: Send) -> None:
+    send("hello")
 
 
-def _errs(say: Say) -> None:
+def _fill_the_disk(send: Send) -> None:
     raise OSError(28, "No space left on device")
 
 
-def _blunders(say: Say) -> None:
-    raise ZeroDivisionError("in the task")
+def _divide_by_zero(send: Send) -> None:
+    raise ZeroDivisionError("in the job")
 
 
-def _counts_workers(say: Say) -> None:
-    say(choose_workers(12, None))
+def _send_workers(send: Send) -> None:
+    send(choose_workers(12, None))
 
 
-def test_a_task_has_its_core_and_no_more() -> None:
-    heard: list[Any] = []
-    run_tasks({"one": _counts_workers}, lambda name, message: heard.append(message), 1)
-    assert heard == [1]
+def test_the_backend_of_a_job_starts_no_workers() -> None:
+    messages: list[Any] = []
+    run_in_processes({"one": _send_workers}, lambda name, message: messages.append(message), 1)
+    assert messages == [1]
 
 
-def test_a_task_whose_process_dies_does_not_stop_the_others() -> None:
-    heard: list[tuple[str, Any]] = []
-    tasks = {"dying": _dies, "full": _errs, "blundering": _blunders, "well": _speaks}
-    failed = run_tasks(tasks, lambda name, message: heard.append((name, message)), 1)
-    assert failed.keys() == {"dying", "full", "blundering"}
-    assert "_blunders" in failed["blundering"], "where it arose"
-    assert "ended with -9" in failed["dying"]
+def test_a_job_that_fails_does_not_stop_the_others() -> None:
+    messages: list[tuple[str, Any]] = []
+    jobs = {"dead": _die, "full": _fill_the_disk, "broken": _divide_by_zero, "good": _greet}
+    failed = run_in_processes(jobs, lambda *sent: messages.append(sent), 1)
+    assert failed.keys() == {"dead", "full", "broken"}
+    assert "_divide_by_zero" in failed["broken"], "the traceback"
+    assert "ended with -9" in failed["dead"]
     assert "No space left" in failed["full"]
-    assert ("well", "hello") in heard
+    assert ("good", "hello") in messages
 
 
-def _sleeps(file: Path, say: Say) -> None:
+def _sleep(file: Path, send: Send) -> None:
     file.write_text(str(os.getpid()))
-    say("up")
+    send("started")
     time.sleep(600)
 
 
 def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
     def interrupt(name: str, message: Any) -> None:
-        if message == "up":
+        if message == "started":
             raise KeyboardInterrupt
 
     file = tmp_path / "pid"
     before = dict(os.environ)
     with pytest.raises(KeyboardInterrupt):
-        run_tasks({"sleeping": partial(_sleeps, file)}, interrupt, 1)
+        run_in_processes({"sleeping": partial(_sleep, file)}, interrupt, 1)
     assert dict(os.environ) == before
     with pytest.raises(ProcessLookupError):
         os.kill(int(file.read_text()), 0)
 
 
-def test_an_interrupt_leaves_no_process_that_has_just_begun(
+def test_an_interrupt_leaves_no_process_that_has_just_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun: list[BaseProcess] = []
+    started_processes: list[BaseProcess] = []
     start, end = SpawnProcess.start, threading.Event()
 
     def interrupted(process: BaseProcess) -> None:
         start(process)
-        begun.append(process)
+        started_processes.append(process)
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.1)
 
     monkeypatch.setattr(SpawnProcess, "start", interrupted)
-    other = threading.Thread(target=end.wait)  # it takes the signal where the main thread does not
+    other = threading.Thread(
+        target=end.wait
+    )  # this thread may receive the signal instead of the main one
     other.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_tasks({"sleeping": partial(_sleeps, tmp_path / "pid")}, deaf, 1)
+            run_in_processes({"sleeping": partial(_sleep, tmp_path / "pid")}, ignore, 1)
     finally:
         end.set()
         other.join()
-    assert [process.exitcode for process in begun] == [-signal.SIGTERM]
+    assert [process.exitcode for process in started_processes] == [-signal.SIGTERM]
 
 
-def test_jobs_must_be_a_number_of_processes() -> None:
-    with pytest.raises(GymMaraError, match="jobs"):
-        run_tasks({}, deaf, 0)
+def test_there_must_be_at_least_one_process() -> None:
+    with pytest.raises(GymMaraError, match="processes must be a whole number of at least 1"):
+        run_in_processes({}, ignore, 0)
 
 
-def test_the_grid_says_what_it_is(finished_grid: Path) -> None:
+def test_grid_json_holds_the_grid(finished_grid: Path) -> None:
     about = json.loads((finished_grid / "grid.json").read_text())
     assert about["algos"] == ["ppo", "acktr"]
     assert about["preset_name"] == "tuned"

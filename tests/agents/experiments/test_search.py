@@ -1,4 +1,4 @@
-"""The search for hyperparameters: it goes on where it was cut off, and never tunes on seeds that are reported."""
+"""The search for hyperparameters: it can be resumed, and it never uses the seeds of reported results."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gym_mara.agents.experiments import search as module
 from gym_mara.agents.experiments.search import (
     FIRST_SEED,
     Search,
-    best,
-    finished,
+    best_trial,
+    finished_trials,
     open_study,
     run_search,
+    run_trials,
     values_of,
     with_values,
-    work,
 )
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent, train
@@ -30,13 +30,11 @@ from gym_mara.errors import GymMaraError, TrainingDivergedError
 SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
 
 
-def deaf(*arguments: Any) -> None:
-    """Nobody listens."""
+def ignore(*arguments: Any) -> None:
+    """Messages go nowhere."""
 
 
-def test_a_search_goes_on_where_it_was_cut_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_search_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = []
 
     def remember(config: Any, *arguments: Any, **keywords: Any) -> Any:
@@ -44,28 +42,28 @@ def test_a_search_goes_on_where_it_was_cut_off(
         return train(config, *arguments, **keywords)
 
     monkeypatch.setattr(module, "train", remember)
-    work(SMALL, tmp_path / "study", deaf)
+    run_trials(SMALL, tmp_path / "study", ignore)
     study = open_study(SMALL, tmp_path / "study")
-    assert finished(study) == 2
+    assert finished_trials(study) == 2
     more = Search(**{**vars(SMALL), "trials": 3})
-    work(more, tmp_path / "study", deaf)
-    assert finished(open_study(more, tmp_path / "study")) == 3
+    run_trials(more, tmp_path / "study", ignore)
+    assert finished_trials(open_study(more, tmp_path / "study")) == 3
     assert len(set(seeds)) == 3
     assert min(seeds) >= FIRST_SEED
 
 
-def test_a_trial_that_was_killed_is_tried_again(tmp_path: Path) -> None:
+def test_a_killed_trial_is_repeated(tmp_path: Path) -> None:
     study = open_study(SMALL, tmp_path)
     acktr = algorithm("acktr")
     space = acktr.search_space
     first = values_of(acktr.preset("tuned", teleports=True), space)
-    study.ask()  # and never told
+    study.ask()  # its result never arrives
     killed = study.ask()
     killed.suggest_float("learning_rate", *space.arguments["learning_rate"], log=True)
-    assert run_search(SMALL, tmp_path, 1, deaf) == {}
+    assert run_search(SMALL, tmp_path, 1, ignore) == {}
     trials = open_study(SMALL, tmp_path).get_trials()
     assert not any(trial.state.name == "RUNNING" for trial in trials)
-    assert finished(study) == 2
+    assert finished_trials(study) == 2
     ended = [trial.params for trial in trials if trial.state.name == "COMPLETE"]
     assert ended[0] == first
     assert ended[1]["learning_rate"] == killed.params["learning_rate"]
@@ -78,13 +76,13 @@ def test_a_trial_that_diverges_does_not_end_the_search(
         raise TrainingDivergedError("the gradient is not finite")
 
     monkeypatch.setattr(module, "train", diverge)
-    work(SMALL, tmp_path, deaf)
+    run_trials(SMALL, tmp_path, ignore)
     study = open_study(SMALL, tmp_path)
-    assert finished(study) == 2
-    assert best(study) is None
+    assert finished_trials(study) == 2
+    assert best_trial(study) is None
 
 
-def test_what_is_wrong_with_every_trial_ends_the_search(
+def test_an_error_that_every_trial_would_meet_ends_the_search(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*arguments: Any, **keywords: Any) -> None:
@@ -92,14 +90,14 @@ def test_what_is_wrong_with_every_trial_ends_the_search(
 
     monkeypatch.setattr(module, "train", full)
     with pytest.raises(GymMaraError, match="no space left"):
-        work(SMALL, tmp_path, deaf)
-    assert finished(open_study(SMALL, tmp_path)) == 0
+        run_trials(SMALL, tmp_path, ignore)
+    assert finished_trials(open_study(SMALL, tmp_path)) == 0
 
 
-def test_a_bad_trial_is_given_up_whatever_its_rollouts_length(
+def test_a_bad_trial_is_pruned_whatever_the_length_of_its_rollouts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Evaluations are compared by their number, not by the steps at which they happened to come."""
+    """Evaluations are compared by their number, not by their steps."""
     search = Search(**{**vars(SMALL), "trials": 12, "steps": 10_000})
     played: list[int] = []
 
@@ -110,34 +108,34 @@ def test_a_bad_trial_is_given_up_whatever_its_rollouts_length(
         for number in range(1, 11):
             shown = {"eval_reward_per_step": reward, "evaluations": number}
             report(number * 1000 // rollout * rollout, shown)
-            report(number * 1000 // rollout * rollout + 1, shown)  # nothing new
+            report(number * 1000 // rollout * rollout + 1, shown)  # the same evaluation again
             played[-1] = number
         return ""
 
     monkeypatch.setattr(module, "train", pretend)
     evaluated = {"reward_per_step": np.array([9.0])}
     monkeypatch.setattr(module, "evaluate_run", lambda *_, **__: evaluated)
-    work(search, tmp_path, deaf)
+    run_trials(search, tmp_path, ignore)
     assert played[:11] == [10] * 11
-    assert played[11] == 2, "the third is the first that is compared"
+    assert played[11] == 2, "it is compared from the third evaluation on"
 
 
 def test_a_search_may_be_short(tmp_path: Path) -> None:
     short = Search(**{**vars(SMALL), "steps": 5, "trials": 1})
-    work(short, tmp_path, deaf)
-    assert best(open_study(short, tmp_path)) is not None
+    run_trials(short, tmp_path, ignore)
+    assert best_trial(open_study(short, tmp_path)) is not None
 
 
-def test_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
+def test_only_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
     with FileLock(tmp_path / ".lock"), pytest.raises(GymMaraError, match="another process"):
-        run_search(SMALL, tmp_path, 1, deaf)
+        run_search(SMALL, tmp_path, 1, ignore)
 
 
-def test_several_processes_may_search(tmp_path: Path) -> None:
+def test_several_processes_search_together(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
-    assert run_search(SMALL, tmp_path, 2, deaf) == {}
-    assert finished(open_study(SMALL, tmp_path)) >= 2
+    assert run_search(SMALL, tmp_path, 2, ignore) == {}
+    assert finished_trials(open_study(SMALL, tmp_path)) >= 2
 
 
 def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
@@ -149,7 +147,7 @@ def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_value_of_a_space_is_one_that_the_algorithm_takes(algo: str) -> None:
+def test_the_algorithm_accepts_the_values_of_its_search_space(algo: str) -> None:
     space = algorithm(algo).search_space
     chosen = {
         name: values.high if isinstance(values, LogRange) else values[-1]

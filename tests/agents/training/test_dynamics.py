@@ -13,7 +13,7 @@ from gym_mara.agents.algorithms.base import Preset
 from gym_mara.agents.inspection.transfer import SETTLED, settled_after, transfer
 from gym_mara.agents.runs.evaluation import evaluate_run, make_env
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.agents.training.callbacks import Report
+from gym_mara.agents.training.callbacks import OnProgress
 from gym_mara.agents.training.train import resume, train
 from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
 from gym_mara.errors import GymMaraError
@@ -24,12 +24,12 @@ ROLLOUT = 16 * 32
 SMALL = Preset(num_envs=16, policy="natural", arguments={"n_steps": 32, "batch_size": 128})
 
 
-def _train(out: Path, report: Report = silent, updates: int = 2) -> RunFolder:
+def _train(out: Path, on_progress: OnProgress = silent, updates: int = 2) -> RunFolder:
     """A run on the dynamic backend, with random parameters and few arms."""
     options = {"randomisation": {"mass": [0.9, 1.1], "sensor_noise": [0.0, 1e-3]}}
     about: dict[str, Any] = {"env": "MARA-v0", "backend": "dart", "env_options": options}
     about |= {"steps": updates * ROLLOUT, "checkpoint_every": ROLLOUT}
-    return train(config(**about), out, report, preset=SMALL)
+    return train(config(**about), out, on_progress, preset=SMALL)
 
 
 @pytest.fixture(scope="module")
