@@ -12,7 +12,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from gym_mara.backends.workers import cores
+from gym_mara.backends.processes import cores
 from gym_mara.cli.common import (
     BackendOption,
     EnvOption,
