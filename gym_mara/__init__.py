@@ -1,8 +1,8 @@
-"""gym_mara: Gymnasium environments for the modular robot arm MARA. Importing it registers them."""
+"""gym_mara: Gymnasium environments for the modular robot arm MARA and other arms. Importing it registers them."""
 
 from gymnasium.envs.registration import register
 
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
 
 __version__ = "0.1.0"
 
@@ -12,7 +12,7 @@ for _name in TASKS:
         entry_point="gym_mara.envs:MaraEnv",
         vector_entry_point="gym_mara.envs:MaraVectorEnv",
         kwargs={"task": _name},
-        max_episode_steps=2048,
+        max_episode_steps=MAX_EPISODE_STEPS,
     )
 
 register(

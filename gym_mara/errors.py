@@ -1,4 +1,4 @@
-"""The errors a user can mend: each says what was wrong, what is allowed and what to do."""
+"""Errors that a user can correct. Each message states what was wrong, what is allowed and what to do."""
 
 from __future__ import annotations
 
@@ -10,11 +10,18 @@ from typing import Any
 
 
 class GymMaraError(ValueError):
-    """Wrong input to gym_mara."""
+    """The base class of gym_mara's errors; most of them report invalid input."""
 
 
 class MissingExtraError(GymMaraError, ImportError):
-    """A library that an optional part needs is not installed, or too old."""
+    """An optional library is not installed, is too old, or cannot be imported.
+
+    Args:
+        part: the part of gym_mara that needs the library.
+        library: the library.
+        extra: the extra of gym_mara that installs the library.
+        why: the reason, which follows the library in the message.
+    """
 
     def __init__(
         self, part: str, library: str, extra: str, why: str = "which is not installed"
@@ -27,11 +34,11 @@ class MissingExtraError(GymMaraError, ImportError):
 
 
 class TrainingDivergedError(GymMaraError):
-    """A training cannot go on: its numbers are no longer finite."""
+    """A training stopped because its values are no longer finite."""
 
 
 def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = False) -> float:
-    """A value that must be a finite, positive number, or zero where that is allowed.
+    """Check that a value is a finite, positive number, or zero if `or_zero` is true, and return it as a float.
 
     Raises:
         GymMaraError: it is not.
@@ -40,14 +47,14 @@ def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = Fa
         number = float(value)
         if 0.0 < number < math.inf or (or_zero and number == 0.0):
             return number
-    wanted = "not negative" if or_zero else "positive"
+    allowed = "not negative" if or_zero else "positive"
     raise GymMaraError(
-        f"{name} must be finite and {wanted}{f' ({unit})' if unit else ''}, not {value!r}"
+        f"{name} must be finite and {allowed}{f' ({unit})' if unit else ''}, not {value!r}"
     )
 
 
 def whole_number(name: str, value: Any) -> int:
-    """A value that must be a whole number of at least 1.
+    """Check that a value is a whole number of at least 1, and return it as an int.
 
     Raises:
         GymMaraError: it is not.
@@ -58,8 +65,8 @@ def whole_number(name: str, value: Any) -> int:
 
 
 def unknown(kind: str, name: object, valid: Iterable[str], where: str = "") -> GymMaraError:
-    """An error for a name that is not among the valid ones, with the nearest of them."""
+    """Make the error for an unknown name. It suggests the most similar valid name and lists all of them."""
     names = sorted(valid)
-    near = difflib.get_close_matches(str(name), names, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    similar = difflib.get_close_matches(str(name), names, n=1)
+    hint = f" Did you mean {similar[0]!r}?" if similar else ""
     return GymMaraError(f"unknown {kind} {name!r}{where}.{hint} Valid: {', '.join(names)}.")

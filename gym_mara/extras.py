@@ -1,4 +1,4 @@
-"""Optional libraries: named, with the version wanted, where one is absent or too old."""
+"""Imports of optional libraries, with an error that names a missing library and the extra that installs it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from gym_mara.errors import MissingExtraError
 
 @contextmanager
 def needs(part: str, extra: str, *libraries: str) -> Iterator[None]:
-    """Import what a part of gym_mara needs of an extra.
+    """Check the versions of optional libraries, then import them in the `with` block.
 
     Args:
-        part: what needs it, as an error begins.
-        extra: the extra, which says in which versions.
-        libraries: those of the extra that the part needs; all of them where none is named.
+        part: the part of gym_mara that needs the libraries; error messages begin with it.
+        extra: the extra of gym_mara that installs the libraries and defines their versions.
+        libraries: the libraries of the extra that the part needs; all of them if none is given.
 
     Raises:
-        MissingExtraError: a library is absent, too old, or cannot be imported.
+        MissingExtraError: a library is not installed, is too old, or cannot be imported.
     """
-    wanted_ones = [r for r in _requirements(extra) if not libraries or r.name in libraries]
-    for wanted in wanted_ones:
-        named = f"{wanted.name}{wanted.specifier}"
+    requirements = [r for r in _requirements(extra) if not libraries or r.name in libraries]
+    for requirement in requirements:
+        library = f"{requirement.name}{requirement.specifier}"
         try:
-            found = version(wanted.name)
+            installed = version(requirement.name)
         except PackageNotFoundError:
-            raise MissingExtraError(part, named, extra) from None
-        if not wanted.specifier.contains(found, prereleases=True):
-            raise MissingExtraError(part, named, extra, f"and {found} is installed")
+            raise MissingExtraError(part, library, extra) from None
+        if not requirement.specifier.contains(installed, prereleases=True):
+            raise MissingExtraError(part, library, extra, f"and {installed} is installed")
     try:
         yield
     except MissingExtraError:
@@ -41,17 +41,17 @@ def needs(part: str, extra: str, *libraries: str) -> Iterator[None]:
             raise
         raise MissingExtraError(part, error.name or str(error), extra) from error
     except ImportError as error:
-        names = " and ".join(libraries or [r.name for r in wanted_ones]) or error.name or extra
+        names = " and ".join(libraries or [r.name for r in requirements]) or error.name or extra
         raise MissingExtraError(
             part, names, extra, f"which cannot be imported ({error})"
         ) from error
 
 
 def _requirements(extra: str) -> list[Requirement]:
-    """What an extra asks for, as gym_mara was installed; nothing is known where it was not."""
+    """The requirements of an extra, from the metadata of the installed gym_mara; none if it is not installed."""
     try:
         texts = requires("gym_mara") or []
     except PackageNotFoundError:
         return []
-    wanted = [Requirement(text) for text in texts]
-    return [r for r in wanted if r.marker and r.marker.evaluate({"extra": extra})]
+    requirements = [Requirement(text) for text in texts]
+    return [r for r in requirements if r.marker and r.marker.evaluate({"extra": extra})]

@@ -1,8 +1,8 @@
-"""Reward regression: record a task's rewards over a fixed set of states, and find what moved since.
+"""Reward regression: record a task's rewards at a fixed set of states, and later find the values that have changed.
 
-A record is a CSV file. Its first line, a comment, says what was recorded; then comes a row per state: the configuration
-that the arm is put at, the terms of the reward, and the reward. The states are read from the record, so that a check
-depends on nothing but the code under test.
+A record is a CSV file. Its first line is a comment with the environment, the backend and the options. Then follows one
+row per state: the arm's configuration, the terms of the reward, and the reward. A check reads the states from the
+record, so that its result depends only on the code under test.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.inverse_kinematics import solve_ik
@@ -28,24 +30,24 @@ _HEADER = "# gym_mara reward record: "
 
 @dataclass(frozen=True)
 class Record:
-    """The rewards of one environment on one backend over S states."""
+    """The rewards of one environment on one backend at S states."""
 
     env: str
     backend: str
     options: dict[str, Any]
-    """Keyword arguments of the environment besides the backend."""
+    """The keyword arguments of the environment, without the backend."""
     q: Floats
-    """The configurations (S, J), rad."""
+    """The configurations (S, J), rad (m for a prismatic joint)."""
     values: dict[str, Floats]
-    """The terms of the reward, `collided` and `reward`, each (S,)."""
+    """The terms of the reward, `collided` and `reward` by name, each (S,)."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A value that is not what was recorded."""
+    """A value that differs from its record."""
 
     row: int
-    """The state's number, from 0."""
+    """The index of the state, from 0."""
     name: str
     recorded: float
     now: float
@@ -58,19 +60,23 @@ class Moved:
 
 
 def record(
-    env: str, backend: str = "pinocchio", options: dict[str, Any] | None = None, states: int = 256
+    env: str,
+    backend: str = DEFAULT_BACKEND,
+    options: dict[str, Any] | None = None,
+    states: int = 256,
 ) -> Record:
-    """Compute the rewards of an environment over a grid of states.
+    """Compute the rewards of an environment at a set of states.
 
-    Half of the states fill the joints' ranges evenly (a Kronecker sequence); half lie on the way from the start to the
-    target, ever closer together, down to 0.1 mm and less before it: there the reward is steep.
+    One half of the states is spread evenly over the joint ranges (a Kronecker sequence). The other half lies on the
+    straight line in joint space from the home configuration to the target. These states become denser towards the
+    target, where the reward is steep; the last one is about 0.1 mm or less away from it.
 
     Raises:
-        GymMaraError: a name is unknown, or there are less than two states.
+        GymMaraError: a name is unknown, or there are fewer than two states.
     """
     if states < 2:
         raise GymMaraError(f"states must be at least 2, not {states}")
-    simulation = Simulation(env, 1, **_robot(options or {}), backend=backend)
+    simulation = _simulation(env, backend, options or {}, 1)
     try:
         q = _grid(simulation, states)
     finally:
@@ -79,14 +85,14 @@ def record(
 
 
 def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Record:
-    """Compute the rewards of an environment at configurations q (S, J), rad, where the arm rests.
+    """Compute the rewards of an environment with the arm at rest at configurations q (S, J), rad.
 
     Raises:
-        GymMaraError: a name is unknown, or the configurations do not fit the robot.
+        GymMaraError: a name is unknown, or a configuration has the wrong length or exceeds the joint limits.
     """
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
-    simulation = Simulation(env, len(q), **_robot(options), backend=backend)
+    simulation = _simulation(env, backend, options, len(q))
     try:
         for number, row in enumerate(q):
             simulation.robot.checked_q(row, f"state {number} of the record")
@@ -100,15 +106,15 @@ def evaluate(env: str, backend: str, options: dict[str, Any], q: Floats) -> Reco
 
 
 def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Moved]:
-    """What differs by more than the tolerance, in the order of the states.
+    """The values that differ by more than the tolerance, in the order of the states.
 
     Raises:
-        GymMaraError: the two do not hold the same terms.
+        GymMaraError: the two records do not have the same terms.
     """
     if recorded.values.keys() != now.values.keys():
         raise GymMaraError(
-            f"the record holds {', '.join(recorded.values)}; the task now has {', '.join(now.values)}: "
-            "record anew if that is meant"
+            f"the record has the terms {', '.join(recorded.values)}, but the task now has {', '.join(now.values)}: "
+            "if this is intended, delete the record and write a new one"
         )
     moved = [
         Moved(row, name, float(old), float(new))
@@ -120,10 +126,10 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
 
 
 def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> list[Moved]:
-    """Compute a record anew, on its own backend or another, and return what moved.
+    """Compute the rewards of a record again, on its backend or another, and return the values that have changed.
 
     Raises:
-        GymMaraError: the file is missing or damaged, or the task's terms are others now.
+        GymMaraError: the file is missing or damaged, or the task now has other terms.
     """
     recorded = read(file)
     now = evaluate(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
@@ -134,7 +140,7 @@ def write(file: Path, recorded: Record) -> None:
     """Write a record to a new file.
 
     Raises:
-        GymMaraError: the file exists, or cannot be written; nothing is overwritten.
+        GymMaraError: the file exists and is not overwritten, or it cannot be written.
     """
     about = {"env": recorded.env, "backend": recorded.backend, "options": recorded.options}
     text = io.StringIO()
@@ -164,7 +170,7 @@ def read(file: Path) -> Record:
     try:
         header, *lines = file.read_text().splitlines()
         if not header.startswith(_HEADER):
-            raise ValueError("it does not begin with the header of a record")
+            raise ValueError("its first line is not the header of a record")
         about = json.loads(header.removeprefix(_HEADER))
         names = lines[0].split(",")
         columns = np.array([[float(x) for x in line.split(",")] for line in lines[1:]]).T
@@ -174,22 +180,20 @@ def read(file: Path) -> Record:
     except OSError as error:
         raise GymMaraError(f"cannot read {str(file)!r}: {error.strerror}") from error
     except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise GymMaraError(f"{str(file)!r} is no reward record: {error}") from error
+        raise GymMaraError(f"{str(file)!r} is not a reward record: {error}") from error
 
 
-def _robot(options: dict[str, Any]) -> dict[str, Any]:
-    """The options as Simulation takes them."""
-    rest = {k: v for k, v in options.items() if k not in ("robot", "ee_frame")}
-    return {
-        "robot": options.get("robot", "mara"),
-        "ee_frame": options.get("ee_frame"),
-        "options": rest,
-    }
+def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
+    """A simulation of N arms, from the keyword arguments of an environment."""
+    rest = {name: v for name, v in options.items() if name not in ("robot", "ee_frame")}
+    robot, ee_frame = options.get("robot", "mara"), options.get("ee_frame")
+    return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
 
 
 def _grid(simulation: Simulation, states: int) -> Floats:
+    """The configurations (S, J) of `record`, rad."""
     robot, goal = simulation.robot, simulation.goal
-    # Kronecker sequence of the generalised golden ratio: even in any number of dimensions.
+    # The Kronecker sequence of the generalised golden ratio is evenly spread in any number of dimensions.
     phi = 2.0
     for _ in range(64):
         phi = (1.0 + phi) ** (1.0 / (robot.num_joints + 1))

@@ -1,31 +1,30 @@
 """Unit quaternions [w, x, y, z] in NumPy, batched over leading axes.
 
-Everything here is a fixed sequence of operations per row, so that a row's result does not depend on the batch it is in.
+Each row goes through the same sequence of operations, so that its result does not depend on the rest of the batch.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats
 
-# b in a ⊗ b as a matrix acting on a: entry (i, j) is sign[i, j] * b[index[i, j]].
+# a ⊗ b as a matrix of b times a: entry (i, j) is sign[i, j] * b[index[i, j]].
 _RIGHT_INDEX = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 _RIGHT_SIGN = np.array(
     [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]]
 )
 ZERO = 1e-9
-"""Components no larger than this count as zero."""
-# Constants are arrays here: a ufunc on one row takes a Python number at twice the cost.
+"""Components with an absolute value up to this count as zero."""
+# Arrays, because a NumPy ufunc on one row takes twice as long with a Python number.
 _ZERO, _ONE, _TWO = np.array(ZERO), np.array(1.0), np.array(2.0)
-# How much each component outweighs the next.
+# The weights of the components: each component that is not zero outweighs all that follow it.
 _PRECEDENCE = np.array([1e30, 1e20, 1e10, 1.0])
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def right_matrix(b: Floats) -> Floats:
-    """The matrices (..., 4, 4) that turn a into a ⊗ b, for quaternions b (..., 4)."""
+    """The matrices M (..., 4, 4) with M a = a ⊗ b, for quaternions b (..., 4)."""
     return b[..., _RIGHT_INDEX] * _RIGHT_SIGN
 
 
@@ -35,19 +34,19 @@ def multiply(a: Floats, b: Floats) -> Floats:
 
 
 def conjugate(q: Floats) -> Floats:
-    """The conjugate, which for unit quaternions (..., 4) is the inverse rotation."""
+    """The conjugates of quaternions (..., 4); of unit quaternions, these are the inverse rotations."""
     return q * _CONJUGATE
 
 
 def canonical(q: Floats) -> Floats:
-    """Of the two quaternions (..., 4) of a rotation the one with w >= 0.
+    """Choose the sign of quaternions (..., 4) so that w >= 0: q and -q are the same rotation.
 
-    For half a turn, w = 0 but for rounding, it is the one whose first component that is not zero is positive.
+    For half a turn, where w is zero except for rounding, the first component that is not zero becomes positive.
     """
     w = q[..., :1]
     if np.count_nonzero(np.abs(w) > _ZERO) == w.size:
         return q * np.copysign(_ONE, w)
-    # Each component outweighs all that follow it, unless it counts as zero.
+    # The sign of the first component that does not count as zero.
     sign = np.copysign(1.0, (q * (np.abs(q) > ZERO)) @ _PRECEDENCE)[..., None]
     chosen = q * sign
     chosen[..., 0] = np.abs(chosen[..., 0])
@@ -55,7 +54,7 @@ def canonical(q: Floats) -> Floats:
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:
-    """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, w the real part of a ⊗ conj(b)."""
+    """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, where w is the real part of a ⊗ conj(b)."""
     return _TWO * np.arccos(np.minimum(np.abs(np.vecdot(a, b)), _ONE))
 
 
@@ -72,7 +71,8 @@ def _outer_product_map() -> tuple[Floats, Floats]:
         sign[[0, axis + 1]] = 1.0
         linear[4 * axis] = np.diag(sign)  # R[axis, axis] enters every diagonal entry
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        # w times the axis' component, from the antisymmetric part; the product of the other two, from the symmetric one.
+        # The antisymmetric part of R gives w times the axis' component. The symmetric part gives the product of the other
+        # two components.
         for row, column, value in ((0, axis + 1, 1.0), (axis + 1, 0, 1.0)):
             linear[3 * j + i, row, column] = value
             linear[3 * i + j, row, column] = -value
@@ -88,11 +88,11 @@ _OUTER_LINEAR, _OUTER_CONSTANT = _outer_product_map()
 def from_matrix(rotation: Floats) -> Floats:
     """The quaternions (N, 4), w >= 0, of rotation matrices (N, 3, 3).
 
-    The entries of R are linear in q qᵀ, whose every row is q times one of its components; the row of the largest
-    component is the well-conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
+    4 q qᵀ is an affine function of the entries of R. Each of its rows is q times one of its components. The row of the
+    largest component is the best conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
     """
     rows = np.arange(len(rotation))
     outer = rotation.reshape(-1, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
-    largest = outer[:, 0, ::5].argmax(axis=-1)  # of the diagonal of 4 q qᵀ
+    largest = outer[:, 0, ::5].argmax(axis=-1)  # on the diagonal of 4 q qᵀ
     row = outer.reshape(-1, 4, 4)[rows, largest]
     return canonical(row / (2.0 * np.sqrt(row[rows, largest]))[:, None])

@@ -1,13 +1,10 @@
-"""SimState: what a backend reports, and all that a task sees of the simulation. View: what a renderer sees of it."""
+"""SimState: the state of the simulation, the only data that tasks, recorders and renderers receive from a backend."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.types import Floats, Mask
 
@@ -23,44 +20,31 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SimState:
-    """The state of N arms at one instant; every array is fresh and may be kept.
+    """The state of N arms at one instant. All arrays are fresh: a backend never changes them later.
 
-    Positions and orientations are those of the robot's end-effector frame in the world frame.
+    The end-effector pose and velocity are those of the robot's end-effector frame in the world frame.
     """
 
-    q: NDArray[np.float64]
+    q: Floats
     """Joint positions (N, J), rad (m for a prismatic joint)."""
-    qd: NDArray[np.float64]
+    qd: Floats
     """Joint velocities (N, J), rad/s (m/s), at this instant."""
-    ee_position: NDArray[np.float64]
-    """(N, 3), m."""
-    ee_quaternion: NDArray[np.float64]
-    """(N, 4), [w, x, y, z], w >= 0."""
-    ee_velocity: NDArray[np.float64]
+    ee_position: Floats
+    """End-effector position (N, 3), m."""
+    ee_quaternion: Floats
+    """End-effector orientation (N, 4), [w, x, y, z], w >= 0."""
+    ee_velocity: Floats
     """Linear velocity J(q) q̇ of the end-effector frame's origin (N, 3), m/s."""
-    collided: NDArray[np.bool_]
-    """(N,): links that may collide touched at this instant or at any during the last control period."""
-    time: NDArray[np.float64]
+    collided: Mask
+    """Whether links that are checked for collisions touched, now or during the last control period (N,)."""
+    time: Floats
     """Simulated time since the arm's last reset (N,), s."""
     torque: Floats | None = None
-    """What the motors exerted in the last physics step (N, J), Nm (N for a prismatic joint); None without dynamics."""
+    """Motor torques of the last physics step (N, J), Nm (N for a prismatic joint); None without dynamics."""
     contacts: tuple[tuple[Contact, ...], ...] | None = None
-    """The contacts of each arm during the last control period, N tuples; None where an engine reports none."""
+    """The contacts of each arm during the last control period, N tuples; None if the engine reports no contacts."""
     diverged: Mask | None = None
-    """(N,): the arm's state diverged in the last step, and the one before is reported; None where that cannot be."""
+    """Whether the arm's state diverged in the last step (N,); the other fields then hold the state before that step.
+    None if the state cannot diverge."""
     parameters: Mapping[str, Floats] | None = None
-    """What was drawn for each arm's episode, name → (N, …); None where nothing is random."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class View:
-    """One arm at one instant, as it is to be shown."""
-
-    q: NDArray[np.float64]
-    """(J,), rad."""
-    target_position: NDArray[np.float64]
-    """(3,), m, in the world frame."""
-    target_quaternion: NDArray[np.float64]
-    """(4,), [w, x, y, z]."""
-    touching: frozenset[str] = frozenset()
-    """The links that collide."""
+    """The random parameters of each arm's episode by name, each (N, …); None without randomisation."""

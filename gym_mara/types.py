@@ -1,4 +1,4 @@
-"""The types of arrays, named once."""
+"""The types of arrays."""
 
 from __future__ import annotations
 

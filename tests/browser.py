@@ -1,4 +1,4 @@
-"""A real browser for the tests: headless Chromium."""
+"""Headless Chromium for tests of web pages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from playwright.sync_api import Browser, sync_playwright
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL in software; and none of the calls home that a fresh browser makes.
+# Render WebGL in software, and make no network connections in the background.
 _ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
@@ -25,14 +25,14 @@ _ARGUMENTS = (
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Headless Chromium, which must be installed: tests of what people see are not skipped."""
-    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _NAMES)), None)
-    if found is None:
+    """Start headless Chromium. If it is not installed, the test fails: these tests are never skipped."""
+    executable = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _NAMES)), None)
+    if executable is None:
         raise RuntimeError(
-            "the tests need Chromium: apt-get install chromium, or set CHROMIUM to a browser's path"
+            "these tests need Chromium: apt-get install chromium, or set CHROMIUM to the path of a browser"
         )
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=list(_ARGUMENTS))
+        browser = playwright.chromium.launch(executable_path=executable, args=list(_ARGUMENTS))
         try:
             yield browser
         finally:

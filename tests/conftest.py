@@ -1,8 +1,9 @@
-"""Fixtures of the whole suite."""
+"""Fixtures of the whole test suite."""
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import threading
@@ -18,17 +19,17 @@ from gym_mara.agents.experiments.local import ONE_THREAD
 from gym_mara.robot import RobotModel
 from tests.helpers import robot_model, write
 
-# Tests run in several processes, which share the cores, and so do the processes that they begin.
+# Tests run in several processes, and start more of them. All share the cores, so each uses one thread.
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
-# A shell that runs `make test &` ignores SIGINT, and so would every process that the tests start.
+# After `make test &`, the tests and all processes that they start would ignore SIGINT.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Helpers of multiprocessing that live as long as the process that uses them.
-_LASTING = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
-_GRACE = 10.0
-"""How long a process may take to end after its test, s."""
+# Helper processes of multiprocessing, which live as long as the process that uses them.
+_HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+_GRACE_PERIOD = 10.0
+"""The time for a process to end after its test, s."""
 
 settings.register_profile("gym_mara", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("gym_mara")
@@ -36,40 +37,42 @@ settings.load_profile("gym_mara")
 
 @pytest.fixture(autouse=True)
 def _no_process_is_left_behind() -> Iterator[None]:
-    """Kill the processes that a test has started and not ended, and fail the test."""
-    before = set(_children())
+    """Fail a test that leaves child processes behind, and kill them."""
+    before = set(psutil.Process().children())
     yield
-    deadline = time.monotonic() + _GRACE
-    while (left := set(_children()) - before) and time.monotonic() < deadline:
+    deadline = time.monotonic() + _GRACE_PERIOD
+    while (remaining := _new_children(before)) and time.monotonic() < deadline:
+        gc.collect()  # objects that a test did not close end their processes when they are collected
         time.sleep(0.05)
     commands = []
-    for process in left:
+    for process in remaining:
         with contextlib.suppress(psutil.NoSuchProcess):
             commands.append(" ".join(process.cmdline()))
-            process.kill()
-    assert not commands, f"the test left processes behind: {commands}"
+            for each in (process, *process.children(recursive=True)):
+                each.kill()
+    assert not commands, f"the test left these processes behind: {commands}"
 
 
-def _children() -> list[psutil.Process]:
-    """The living descendants of this process, without those that multiprocessing keeps."""
+def _new_children(before: set[psutil.Process]) -> list[psutil.Process]:
+    """The living child processes that are not in `before`, without the helpers of multiprocessing."""
     children = []
-    for process in psutil.Process().children(recursive=True):
+    for process in set(psutil.Process().children()) - before:
         with contextlib.suppress(psutil.NoSuchProcess):
-            command = " ".join(process.cmdline())
-            if command and not any(name in command for name in _LASTING):
+            command = " ".join(process.cmdline())  # empty for a zombie
+            if command and not any(name in command for name in _HELPERS):
                 children.append(process)
     return children
 
 
 @pytest.fixture(scope="session")
 def mara() -> RobotModel:
-    """MARA, loaded once: a RobotModel does not change."""
+    """MARA, loaded once, because a RobotModel is immutable."""
     return robot_model("mara")
 
 
 @pytest.fixture
 def fake_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of FakeBackend, offered as another package would: by an entry point."""
+    """Register FakeBackend by an entry point, as another package would, and return its name."""
     package = tmp_path / "gym_mara_fake-0.1.dist-info"
     package.mkdir()
     write(package / "METADATA", "Metadata-Version: 2.1\nName: gym_mara_fake\nVersion: 0.1\n")

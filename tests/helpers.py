@@ -1,4 +1,4 @@
-"""What the tests share: robots loaded once, configurations, comparisons, small URDFs."""
+"""Helpers of the tests: cached robots, configurations, golden values, small URDFs, processes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ ENV_IDS = tuple(f"gym_mara/{name}" for name in TASK_NAMES)
 TARGET_Q = (-0.237, -0.5528, 0.8681, 0.0, 1.7207, -0.237)
 """A configuration of MARA within 0.02 mm of the default target."""
 PATH_ENDS = ((0.5, -1.9, -0.3, -2.4, 1.1, -2.6), (0.5, -1.9, -0.3, 2.4, 1.1, -2.6))
-"""Two free configurations of MARA between which motor4 takes the tool through the arm, near -1.15 to 1.06 rad."""
-
+"""Two collision-free configurations of MARA. On the way, with motor4 between about -1.15 and 1.06 rad, the tool collides
+with the arm."""
 
 MODULAR_ARMS: dict[int, list[str]] = {
     3: ["base", "motor_large", "motor_medium", "tool"],
@@ -52,7 +52,7 @@ MODULAR_ARMS: dict[int, list[str]] = {
         "tool",
     ],
 }
-"""An arm of MARA's modules for each number of joints."""
+"""One arm of MARA's modules for each number of joints."""
 
 robot_model = functools.cache(RobotModel.load)
 
@@ -77,7 +77,7 @@ def joint_xml(
     extra: str = "",
     limit: str = '<limit lower="-2" upper="1.5" effort="10" velocity="2"/>',
 ) -> str:
-    """A joint from link NUMBER to link NUMBER + 1, 0.3 m along x and 0.2 m along z, skewed."""
+    """A joint from link NUMBER to link NUMBER + 1, translated by 0.3 m along x and 0.2 m along z, and rotated."""
     return f"""
       <joint name="joint{number}" type="{kind}">
         <parent link="link{number}"/><child link="link{number + 1}"/>
@@ -86,7 +86,7 @@ def joint_xml(
 
 
 def urdf_xml(*joints: str) -> str:
-    """A URDF of one chain, link0, link1, …, with a ball on each link."""
+    """The URDF of a serial chain link0, link1, …, with a sphere on each link."""
     links = "".join(
         f"""
       <link name="link{number}">
@@ -106,7 +106,7 @@ def write(path: Path, text: str) -> Path:
 
 @contextmanager
 def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Python with these arguments, in a process group of its own that is killed at the end, whatever happens."""
+    """Run Python with these arguments in its own process group, and always kill the group at the end."""
     process = subprocess.Popen(
         [sys.executable, *arguments],
         stdout=subprocess.PIPE,

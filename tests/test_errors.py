@@ -1,4 +1,4 @@
-"""The errors a user can mend."""
+"""Errors: their messages and their types."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from gym_mara.errors import GymMaraError, MissingExtraError, unknown
 from gym_mara.testing import pickled
 
 
-def test_unknown_names_the_nearest_and_all_valid_names_in_order() -> None:
+def test_unknown_suggests_a_similar_name_and_lists_all_valid_names() -> None:
     assert str(unknown("engine", "cola", ["fcl", "coal"])) == (
         "unknown engine 'cola'. Did you mean 'coal'? Valid: coal, fcl."
     )
 
 
-def test_unknown_guesses_nothing_where_nothing_is_near() -> None:
+def test_unknown_suggests_nothing_if_no_name_is_similar() -> None:
     assert str(unknown("engine", "xyz", ["fcl", "coal"])) == (
         "unknown engine 'xyz'. Valid: coal, fcl."
     )
 
 
 @pytest.mark.parametrize("name", [None, 7, ["coal"]])
-def test_a_name_need_not_be_a_string(name: object) -> None:
+def test_an_unknown_name_can_be_any_object(name: object) -> None:
     assert f"unknown engine {name!r}." in str(unknown("engine", name, ["fcl"]))
 
 
-def test_a_missing_extra_says_what_to_install_and_pickles() -> None:
+def test_a_missing_extra_error_names_the_extra_and_can_be_pickled() -> None:
     error = MissingExtraError("robot 'ur5'", "example-robot-data", "robots")
     for each in (error, pickled(error)):
         assert isinstance(each, ImportError)
@@ -39,11 +39,11 @@ def test_a_missing_extra_says_what_to_install_and_pickles() -> None:
         )
 
 
-def test_every_error_is_a_value_error() -> None:
+def test_gym_mara_errors_are_value_errors() -> None:
     assert issubclass(GymMaraError, ValueError)
 
 
-def test_a_library_that_is_too_old_is_named_with_the_version_wanted(
+def test_the_error_for_an_old_library_names_the_required_version(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(extras, "version", lambda name: "0.1")
@@ -54,13 +54,13 @@ def test_a_library_that_is_too_old_is_named_with_the_version_wanted(
         pass
 
 
-def test_a_library_that_is_absent_is_named_with_the_version_wanted(
+def test_the_error_for_a_missing_library_names_the_required_version(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def absent(name: str) -> str:
+    def not_found(name: str) -> str:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(extras, "version", absent)
+    monkeypatch.setattr(extras, "version", not_found)
     with (
         pytest.raises(MissingExtraError, match=r"films needs imageio-ffmpeg>=\S+, which is not"),
         extras.needs("films", "render", "imageio-ffmpeg"),
@@ -68,7 +68,7 @@ def test_a_library_that_is_absent_is_named_with_the_version_wanted(
         pass
 
 
-def test_a_library_that_does_not_load_is_told_with_the_reason() -> None:
+def test_the_error_for_a_library_that_cannot_be_imported_gives_the_reason() -> None:
     with (
         pytest.raises(MissingExtraError, match=r"dartpy, which cannot be imported \(no libGL"),
         extras.needs("the backend 'dart'", "dart", "dartpy"),
@@ -76,7 +76,7 @@ def test_a_library_that_does_not_load_is_told_with_the_reason() -> None:
         raise ImportError("no libGL", name="dartpy")
 
 
-def test_a_library_without_a_name_in_its_error_is_named_by_its_extra() -> None:
+def test_an_import_error_without_a_library_name_lists_the_libraries_of_the_extra() -> None:
     with (
         pytest.raises(
             MissingExtraError, match=r"needs dartpy, which cannot be imported \(no libGL"
@@ -86,12 +86,12 @@ def test_a_library_without_a_name_in_its_error_is_named_by_its_extra() -> None:
         raise ImportError("no libGL")
 
 
-def test_a_mistake_of_ours_is_no_missing_library() -> None:
-    with pytest.raises(ModuleNotFoundError) as told, extras.needs("training", "train"):
+def test_a_missing_module_of_gym_mara_is_not_a_missing_extra() -> None:
+    with pytest.raises(ModuleNotFoundError) as error, extras.needs("training", "train"):
         import gym_mara.nowhere  # type: ignore[import-not-found] # noqa: F401
-    assert not isinstance(told.value, MissingExtraError)
+    assert not isinstance(error.value, MissingExtraError)
 
 
-def test_every_extra_that_the_package_asks_for_exists() -> None:
+def test_every_extra_that_the_package_uses_has_requirements() -> None:
     for extra in ("dart", "fcl", "render", "robots", "train"):
         assert extras._requirements(extra), extra

@@ -1,4 +1,4 @@
-"""The form of gym-gazebo2: its ids, its episodes, its statistics, its observation to the letter."""
+"""The interface of gym-gazebo2: ids, episodes, statistics and the original observation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KEYS = {
 }
 
 
-def test_the_bare_ids_come_with_the_import_alone() -> None:
+def test_the_import_registers_the_original_ids() -> None:
     code = (
         "import gymnasium, gym_mara\n"
         "assert 'MARA-v0' not in gymnasium.registry\n"
@@ -38,19 +38,19 @@ def test_the_bare_ids_come_with_the_import_alone() -> None:
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_an_episode_is_that_of_the_package(name: str) -> None:
-    ours, theirs = gymnasium.make(f"gym_mara/{name}"), gymnasium.make(name)
-    np.testing.assert_array_equal(ours.reset(seed=0)[0], theirs.reset(seed=0)[0])
+def test_an_episode_equals_one_of_the_registered_environment(name: str) -> None:
+    env, compat = gymnasium.make(f"gym_mara/{name}"), gymnasium.make(name)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], compat.reset(seed=0)[0])
     rng = np.random.default_rng(0)
     for _ in range(20):
         action = rng.uniform(-2.0, 2.0, 6).astype(np.float32)
-        mine, other = ours.step(action), theirs.step(action)
-        np.testing.assert_array_equal(mine[0], other[0])
-        assert mine[1:4] == other[1:4]
+        expected, result = env.step(action), compat.step(action)
+        np.testing.assert_array_equal(result[0], expected[0])
+        assert result[1:4] == expected[1:4]
 
 
 @pytest.mark.parametrize("size", [3, None])
-def test_the_episode_has_the_size_that_is_set(size: int | None) -> None:
+def test_set_episode_size_sets_the_length_of_episodes(size: int | None) -> None:
     env = GazeboMaraEnv()
     if size is not None:
         env.set_episode_size(size)
@@ -69,7 +69,7 @@ def test_the_episode_has_the_size_that_is_set(size: int | None) -> None:
         assert info["infos"]["num_coll"] == 0
 
 
-def test_the_velocity_is_the_originals_slip_by_keyword() -> None:
+def test_original_observation_replaces_the_velocity_with_the_jacobian_times_the_position() -> None:
     env = GazeboMaraEnv("MARAOrient-v0", original_observation=True, on_collision="continue")
     robot = robot_model("mara")
     env.reset()
@@ -77,9 +77,11 @@ def test_the_velocity_is_the_originals_slip_by_keyword() -> None:
     for q in [np.array(TARGET_Q), *golden_q()[:20]]:
         q = q.clip(robot.lower, robot.upper).astype(np.float32)
         observation = env.step(q)[0]
-        at = observation[:6]
-        # J(q)·q, by the difference along q.
-        ahead, behind = (robot.kinematics().pose((at * (1.0 + s))[None])[0] for s in (step, -step))
+        measured = observation[:6]
+        # J(q)·q by the central difference along q.
+        ahead, behind = (
+            robot.kinematics().pose((measured * (1.0 + s))[None])[0] for s in (step, -step)
+        )
         np.testing.assert_allclose(observation[-3:], (ahead - behind)[0] / (2.0 * step), atol=1e-6)
         assert env.observation_space.contains(observation)
     plain = GazeboMaraEnv("MARAOrient-v0", on_collision="continue")
@@ -90,12 +92,12 @@ def test_the_velocity_is_the_originals_slip_by_keyword() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*action space", "ignore:.*symmetric")
 @pytest.mark.parametrize("options", [{}, {"original_observation": True}, {"real_speed": True}])
-def test_the_checker_accepts_it(options: dict[str, Any]) -> None:
+def test_gymnasiums_checker_accepts_the_environment(options: dict[str, Any]) -> None:
     check_env(gymnasium.make("MARACollisionOrient-v0", **options).unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize(("velocity", "speed"), [(None, 0.5), (0.3, 0.3)])
-def test_the_run_mode_moves_the_joints_at_its_velocity(
+def test_real_speed_moves_the_joints_at_the_given_velocity(
     velocity: float | None, speed: float
 ) -> None:
     env = GazeboMaraEnv(real_speed=True, velocity=velocity)
@@ -105,7 +107,7 @@ def test_the_run_mode_moves_the_joints_at_its_velocity(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"multi_instance": True}, "'multi_instance' has no meaning here.*make as many"),
         ({"port": 11345}, "'port' has no meaning here.*no simulator"),
@@ -114,12 +116,12 @@ def test_the_run_mode_moves_the_joints_at_its_velocity(
         ({"gzclient": True}, "unknown keyword argument 'gzclient'"),
     ],
 )
-def test_a_flag_without_a_meaning_is_told(options: dict[str, Any], told: str) -> None:
-    with pytest.raises(GymMaraError, match=told):
+def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
         GazeboMaraEnv(**options)
 
 
 @pytest.mark.parametrize("size", [0, -1, 2.5, "long"])
-def test_an_episode_of_nonsense_is_refused(size: Any) -> None:
+def test_an_invalid_episode_size_is_refused(size: Any) -> None:
     with pytest.raises(GymMaraError, match="episode_size"):
         GazeboMaraEnv().set_episode_size(size)

@@ -1,4 +1,4 @@
-"""Other arms: every task, on every backend, drawn too."""
+"""Other arms: every task on every backend, and a picture."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ ARMS: dict[str, RobotLike] = {
 
 @pytest.mark.parametrize("backend", backend_names())
 @pytest.mark.parametrize("arm", ARMS)
-def test_an_arm_runs_every_task_and_shows_itself(arm: str, backend: str) -> None:
-    rng, named = np.random.default_rng(0), ARMS[arm]
-    robot = robot_model(named) if isinstance(named, str) else RobotModel.load(named)
+def test_an_arm_runs_every_task_and_can_be_drawn(arm: str, backend: str) -> None:
+    rng, source = np.random.default_rng(0), ARMS[arm]
+    robot = robot_model(source) if isinstance(source, str) else RobotModel.load(source)
     for task in TASKS:
         draws = task == "MARACollisionOrient-v0"
         env = MaraEnv(
@@ -43,5 +43,5 @@ def test_an_arm_runs_every_task_and_shows_itself(arm: str, backend: str) -> None
             picture = env.render()
             assert picture is not None
             off_background = np.abs(picture.astype(int) - picture[0, 0]).max(axis=-1) > 60
-            assert off_background.mean() > 0.01, "the arm"
+            assert off_background.mean() > 0.01, "the arm is visible"
         env.close()

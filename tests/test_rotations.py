@@ -1,4 +1,4 @@
-"""Quaternions: their algebra, and Pinocchio as referee."""
+"""Quaternions: their algebra, and a comparison with Pinocchio."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gym_mara import rotations
-from tests.helpers import Floats
+from gym_mara.types import Floats
 
 
 def _is_direction(q: Floats) -> bool:
     return bool(np.linalg.norm(q) > 0.1)
 
 
-# Small whole numbers bring the degenerate cases: w = 0, half turns, equal components.
+# Integer components produce the degenerate cases: w = 0, half turns, equal components.
 _components = st.one_of(st.integers(-1, 1).map(float), st.floats(-1.0, 1.0, allow_subnormal=False))
 quaternions = (
     arrays(np.float64, 4, elements=_components)
@@ -36,7 +36,7 @@ def _same_rotation(a: Floats, b: Floats) -> bool:
 
 
 @given(quaternions, quaternions)
-def test_multiply_is_the_product_of_the_rotations(a: Floats, b: Floats) -> None:
+def test_multiply_equals_the_product_of_the_matrices(a: Floats, b: Floats) -> None:
     product = rotations.multiply(a, b)
     assert np.linalg.norm(product) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(_matrix(product), _matrix(a) @ _matrix(b), rtol=0.0, atol=1e-12)
@@ -49,7 +49,7 @@ def test_multiply_is_associative(a: Floats, b: Floats, c: Floats) -> None:
     np.testing.assert_allclose(left, right, rtol=0.0, atol=1e-12)
 
 
-def test_multiply_follows_hamilton() -> None:
+def test_multiply_follows_hamiltons_convention() -> None:
     one, i, j, k = np.eye(4)
     np.testing.assert_array_equal(rotations.multiply(i, j), k)
     np.testing.assert_array_equal(rotations.multiply(j, i), -k)
@@ -63,7 +63,7 @@ def test_conjugate_is_the_inverse(q: Floats) -> None:
 
 
 @given(quaternions)
-def test_canonical_keeps_the_rotation_and_has_w_not_negative(q: Floats) -> None:
+def test_canonical_keeps_the_rotation_and_makes_w_not_negative(q: Floats) -> None:
     chosen = rotations.canonical(q)
     assert chosen[0] >= 0.0
     assert _same_rotation(chosen, q)
@@ -71,7 +71,7 @@ def test_canonical_keeps_the_rotation_and_has_w_not_negative(q: Floats) -> None:
 
 
 @given(quaternions)
-def test_from_matrix_returns_the_rotation_it_was_given(q: Floats) -> None:
+def test_from_matrix_inverts_the_conversion_to_a_matrix(q: Floats) -> None:
     (result,) = rotations.from_matrix(_matrix(q)[None])
     assert np.linalg.norm(result) == pytest.approx(1.0, abs=1e-12)
     assert result[0] >= 0.0
@@ -87,17 +87,17 @@ def test_from_matrix_agrees_with_pinocchio_on_many_random_rotations() -> None:
 
 
 @given(quaternions, quaternions)
-def test_angle_is_symmetric_and_that_of_pinocchio(a: Floats, b: Floats) -> None:
+def test_the_angle_is_symmetric_and_agrees_with_pinocchio(a: Floats, b: Floats) -> None:
     angle = rotations.angle_between(a, b)
     assert 0.0 <= angle <= np.pi
     assert angle == rotations.angle_between(b, a)
     assert angle == rotations.angle_between(-a, b)
     turn = np.linalg.norm(pin.log3(_matrix(a) @ _matrix(b).T))
-    # The arccosine of a number near 1 holds half its digits.
+    # The arccosine of a number near 1 has only half of the digits.
     assert angle == pytest.approx(turn, abs=1e-7)
 
 
-def test_angle_of_known_turns() -> None:
+def test_the_angle_of_known_rotations() -> None:
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     turns = np.array([0.0, 0.3, np.pi / 2, np.pi])
     about_y = np.stack([np.cos(turns / 2), np.zeros(4), np.sin(turns / 2), np.zeros(4)], axis=-1)
@@ -111,21 +111,21 @@ def test_normalised_keeps_the_direction(q: Floats) -> None:
     assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_a_row_does_not_depend_on_its_batch() -> None:
+def test_the_result_of_a_row_does_not_depend_on_the_batch() -> None:
     rng = np.random.default_rng(0)
     a, b = rotations.normalised(rng.normal(size=(2, 40, 4)))
     matrices = np.array([_matrix(q) for q in a])
-    together = (
+    batch = (
         rotations.multiply(a, b),
         rotations.angle_between(a, b),
         rotations.from_matrix(matrices),
     )
     for row in range(40):
         one = slice(row, row + 1)
-        alone = (
+        single = (
             rotations.multiply(a[one], b[one]),
             rotations.angle_between(a[one], b[one]),
             rotations.from_matrix(matrices[one]),
         )
-        for batched, single in zip(together, alone, strict=True):
-            np.testing.assert_allclose(batched[one], single, rtol=0.0, atol=1e-15)
+        for all_rows, one_row in zip(batch, single, strict=True):
+            np.testing.assert_allclose(all_rows[one], one_row, rtol=0.0, atol=1e-15)

@@ -76,8 +76,8 @@ class MaraVecEnv(VecEnv):
     def step_wait(
         self,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        observation, reward, terminated, truncated, info = self.env.advance(
-            self.targets(self._actions), with_info=False
+        observation, reward, terminated, truncated, info = self.env.step(
+            self.targets(self._actions)
         )
         self._returns += reward
         self.reward_sum += float(reward.sum())

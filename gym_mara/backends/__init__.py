@@ -1,6 +1,19 @@
 """Backends: engines that move the arms, behind one contract."""
 
 from gym_mara.backends.base import Backend
-from gym_mara.backends.registry import backend_names, backend_settings, make_backend
+from gym_mara.backends.registry import (
+    DEFAULT_BACKEND,
+    backend_names,
+    backend_settings,
+    installed_backends,
+    make_backend,
+)
 
-__all__ = ["Backend", "backend_names", "backend_settings", "make_backend"]
+__all__ = [
+    "DEFAULT_BACKEND",
+    "Backend",
+    "backend_names",
+    "backend_settings",
+    "installed_backends",
+    "make_backend",
+]

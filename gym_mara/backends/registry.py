@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import warnings
-from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -18,6 +16,7 @@ class BrokenBackendError(GymMaraError):
     """Another package offers a backend that cannot be loaded."""
 
 
+DEFAULT_BACKEND = "pinocchio"
 _GROUP = "gym_mara.backends"
 # "module:class"; a module is imported when its backend is first used.
 _BACKENDS = {
@@ -83,15 +82,16 @@ def backend_settings(name: str) -> list[str]:
     return settings + ["workers"] * backend.in_processes
 
 
-def all_backend_settings() -> dict[str, list[str]]:
-    """The settings of every backend that can be imported here, by backend; a warning names each of the others."""
-    settings = {}
+def installed_backends() -> tuple[list[str], list[str]]:
+    """The names of the backends that can be imported here, and for each of the others the reason why not."""
+    installed, reasons = [], []
     for name in backend_names():
         try:
-            settings[name] = backend_settings(name)
+            backend_class(name)
+            installed.append(name)
         except GymMaraError as error:
-            warnings.warn(f"without the backend {name!r}: {error}", stacklevel=2)
-    return settings
+            reasons.append(str(error))
+    return installed, reasons
 
 
 def make_backend(
@@ -99,7 +99,6 @@ def make_backend(
     robot: RobotModel,
     num_envs: int,
     options: dict[str, Any],
-    others: Sequence[str] = (),
 ) -> Backend:
     """Make a backend for N arms, in worker processes where `in_processes` and `workers` say so.
 
@@ -108,7 +107,6 @@ def make_backend(
         robot: the arm.
         num_envs: N.
         options: the backend's settings, and `workers` where it runs in processes.
-        others: other keyword arguments that the caller accepts; the error about an unknown one lists them too.
 
     Raises:
         GymMaraError: the name or a setting is unknown, or a setting is out of its range.
@@ -117,9 +115,7 @@ def make_backend(
     backend, settings = backend_class(name), backend_settings(name)
     for option in options:
         if option not in settings:
-            raise unknown(
-                "keyword argument", option, [*settings, *others], f" with backend {name!r}"
-            )
+            raise unknown("setting", option, settings, f" of the backend {name!r}")
     if not backend.in_processes:
         return backend(robot, num_envs, **options)
     options = dict(options)

@@ -14,9 +14,13 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Column, Table
 
+from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
+    AlgoOption,
     BackendOption,
     EnvOption,
+    PresetOption,
     SetOption,
     interruptible,
     keyword_arguments,
@@ -42,8 +46,8 @@ _UNITS = {
 def train(
     context: typer.Context,
     env: EnvOption = "MARA-v0",
-    algo: Annotated[str, typer.Option(help="Algorithm: ppo, trpo or acktr.")] = "ppo",
-    backend: BackendOption = "pinocchio",
+    algo: AlgoOption = DEFAULT_ALGORITHM,
+    backend: BackendOption = DEFAULT_BACKEND,
     steps: Annotated[
         float, typer.Option(help="Environment steps over all arms, such as 1e6.")
     ] = 1e6,
@@ -54,7 +58,7 @@ def train(
             "--out", help="New run folder; by default one under runs/ named after run and time."
         ),
     ] = None,
-    preset: Annotated[str, typer.Option(help="Hyperparameters: tuned or paper.")] = "tuned",
+    preset: PresetOption = DEFAULT_PRESET,
     checkpoint_every: Annotated[
         float, typer.Option(help="Steps between two checkpoints, each of which is evaluated.")
     ] = 5e4,

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from gym_mara.agents.algorithms.registry import ALGORITHMS, preset_names
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.tasks import TASKS
@@ -17,6 +18,10 @@ from gym_mara.tasks import TASKS
 out = Console()
 
 EnvOption = Annotated[str, typer.Option("--env", help="Environment: " + ", ".join(TASKS) + ".")]
+AlgoOption = Annotated[str, typer.Option(help="Algorithm: " + ", ".join(ALGORITHMS) + ".")]
+PresetOption = Annotated[
+    str, typer.Option(help="Hyperparameters: " + " or ".join(preset_names()) + ".")
+]
 BackendOption = Annotated[str, typer.Option(help="Backend: see gym-mara list.")]
 SetOption = Annotated[
     list[str],

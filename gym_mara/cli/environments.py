@@ -1,4 +1,4 @@
-"""gym-mara list and rewards: what needs no agents."""
+"""gym-mara list and rewards: the commands that need no torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import typer
 from rich.table import Column, Table
 
 from gym_mara import regression
-from gym_mara.backends import backend_names
+from gym_mara.agents.algorithms.registry import ALGORITHMS
+from gym_mara.backends import DEFAULT_BACKEND, backend_names
 from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out, task_name
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.catalog import robot_names
@@ -18,7 +19,7 @@ from gym_mara.tasks import TASKS
 
 
 def list_() -> None:
-    """Show the environments, the backends and the robots."""
+    """Show the environments, the algorithms, the backends and the robots."""
     columns = Column("environment", no_wrap=True), "reward uses", "on a collision"
     table = Table(*columns, title="Environments")
     for name, task in TASKS.items():
@@ -26,6 +27,10 @@ def list_() -> None:
         uses += ["orientation"] if getattr(task, "orientation", False) else []
         uses += ["collision"] if getattr(task, "collision_penalty", False) else []
         table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
+    out.print(table)
+    table = Table("algorithm", "what it is", "presets", title="Algorithms")
+    for entry in ALGORITHMS.values():
+        table.add_row(entry.name, entry.summary, ", ".join(entry.presets))
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
     out.print("Robots:", ", ".join(robot_names()), "- or the path of a URDF")
@@ -40,7 +45,9 @@ def rewards(
     env: EnvOption = "MARA-v0",
     backend: Annotated[
         str | None,
-        typer.Option(help="Backend; by default pinocchio, or with --check the record's own."),
+        typer.Option(
+            help=f"Backend; by default {DEFAULT_BACKEND}, or with --check the record's own."
+        ),
     ] = None,
     states: Annotated[int, typer.Option(help="How many states to record.")] = 256,
     tolerance: Annotated[float, typer.Option(help="How far a value may move.")] = 1e-9,
@@ -51,7 +58,7 @@ def rewards(
         raise GymMaraError("say either --record FILE or --check FILE")
     if record is not None:
         made = regression.record(
-            task_name(env), backend or "pinocchio", keyword_arguments(settings), states
+            task_name(env), backend or DEFAULT_BACKEND, keyword_arguments(settings), states
         )
         regression.write(record, made)
         out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")

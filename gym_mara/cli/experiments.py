@@ -12,10 +12,19 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
+from gym_mara.agents.algorithms.registry import (
+    ALGORITHMS,
+    DEFAULT_ALGORITHM,
+    DEFAULT_PRESET,
+    preset_names,
+)
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.backends.processes import cores
 from gym_mara.cli.common import (
+    AlgoOption,
     BackendOption,
     EnvOption,
+    PresetOption,
     interruptible,
     needs_agents,
     out,
@@ -42,12 +51,15 @@ def benchmark(
         PAPER_TASKS
     ),
     algos: Annotated[
-        str, typer.Option(help="Algorithms, with commas between them.")
-    ] = "ppo,trpo,acktr",
+        str | None,
+        typer.Option(
+            help="Algorithms, with commas between them; by default all that have the preset."
+        ),
+    ] = None,
     seeds: Annotated[int, typer.Option(help="Runs of each pair, with the seeds 0, 1, …")] = 3,
     steps: StepsOption = 1e6,
-    preset: Annotated[str, typer.Option(help="Hyperparameters: tuned or paper.")] = "tuned",
-    backend: BackendOption = "pinocchio",
+    preset: PresetOption = DEFAULT_PRESET,
+    backend: BackendOption = DEFAULT_BACKEND,
     checkpoint_every: Annotated[
         float, typer.Option(help="Steps between two checkpoints of a run.")
     ] = 5e4,
@@ -74,7 +86,7 @@ def benchmark(
 
     grid = Grid(
         envs=tuple(task_name(env.strip()) for env in envs.split(",")),
-        algos=tuple(algo.strip() for algo in algos.split(",")),
+        algos=_algorithms(algos, preset),
         seeds=seeds,
         steps=whole("--steps", steps),
         preset_name=preset,
@@ -103,6 +115,14 @@ def benchmark(
         )
 
 
+def _algorithms(names: str | None, preset: str) -> tuple[str, ...]:
+    if names is not None:
+        return tuple(name.strip() for name in names.split(","))
+    if preset not in preset_names():
+        raise unknown("preset", preset, preset_names())
+    return tuple(name for name, entry in ALGORITHMS.items() if preset in entry.presets)
+
+
 def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:
     """Draw a benchmark's figures and write its tables."""
     with needs_agents():
@@ -115,7 +135,7 @@ def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.
 
 def search(
     env: EnvOption = "MARACollisionOrient-v0",
-    algo: Annotated[str, typer.Option(help="Algorithm: ppo, trpo or acktr.")] = "ppo",
+    algo: AlgoOption = DEFAULT_ALGORITHM,
     steps: StepsOption = 1e6,
     trials: Annotated[
         int, typer.Option(help="How many trials in all, or a few more where several run at once.")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
     SetOption,
@@ -17,7 +17,6 @@ from gym_mara.cli.common import (
     out,
     task_name,
 )
-from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError, positive_number
 
 PolicyOption = Annotated[
@@ -53,8 +52,12 @@ def watch(
     if run is None and video is not None:
         raise GymMaraError("--video films a run's policy: name the run folder")
     if run is None:
+        from gym_mara.viewer import watch as open_viewer
+
+        # Who jogs the arm into the table wants to see it there, and not back at home.
+        keywords = {"on_collision": "continue", **options}
         with interruptible("Closed."):
-            _by_hand(task_name(env), backend or "pinocchio", speed, options)
+            open_viewer(task_name(env), backend or DEFAULT_BACKEND, keywords, speed=speed)
         return
     with needs_agents():
         from gym_mara.agents.inspection.watch import film_run, watch_run
@@ -71,22 +74,6 @@ def watch(
         raise GymMaraError("the browser shows one backend at a time, and can switch; name one")
     with interruptible("Closed."):
         watch_run(folder, backends[0], options, policy, speed)
-
-
-def _by_hand(task: str, backend: str, speed: float, options: dict[str, Any]) -> None:
-    # A hand that leads the arm into the table wants to see it there, and not back at home.
-    options = {"on_collision": "continue", **options}
-    env = MaraEnv(task, backend=backend, render_mode="human", **options)
-    try:
-        env.reset()
-        assert env.viewer is not None
-        env.viewer.lead_by_hand()
-        env.viewer.set_speed(speed)
-        home = env.simulation.robot.home.astype(np.float32)
-        while True:
-            env.step(home)
-    finally:
-        env.close()
 
 
 def report(

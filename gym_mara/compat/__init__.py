@@ -1,1 +1,1 @@
-"""Forms that other packages gave these environments."""
+"""Interfaces of other packages to these environments."""

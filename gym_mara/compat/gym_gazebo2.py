@@ -1,49 +1,51 @@
-"""For scripts written for gym-gazebo2: importing this module registers its bare ids, `MARA-v0`, … .
+"""The interface of gym-gazebo2. Importing this module registers its ids without a namespace: `MARA-v0`, … .
 
-docs/from_gym_gazebo2.md maps its flags and scripts.
+docs/from_gym_gazebo2.md maps its flags and scripts to those of gym_mara.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from gymnasium.envs.registration import register
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError, positive_number, whole_number
-from gym_mara.tasks import PAPER_TASKS
-
-Floats = NDArray[np.float64]
+from gym_mara.robot import RobotModel
+from gym_mara.robot.kinematics import Kinematics
+from gym_mara.state import SimState
+from gym_mara.tasks import MAX_EPISODE_STEPS, PAPER_TASKS, Goal, Observation, Part
+from gym_mara.types import Floats
 
 RUN_VELOCITY = 0.5
-"""How fast the joints are in gym-gazebo2's run mode by default, rad/s."""
-# Flags of gym-gazebo2 that say something of Gazebo and ROS alone.
+"""The default joint speed of gym-gazebo2's run mode, rad/s."""
+# Flags of gym-gazebo2 that only concern Gazebo and ROS, and the reason why gym_mara does not need them.
 _NO_MEANING = {
-    "multi_instance": "environments share nothing: make as many as you like",
+    "multi_instance": "environments are independent, so make as many as you like",
     "port": "there is no simulator to connect to",
 }
 
 
 class GazeboMaraEnv(MaraEnv):
-    """MaraEnv with the manners of gym-gazebo2.
+    """MaraEnv with the interface of gym-gazebo2.
 
-    The episode ends by itself, after 2048 steps or what `set_episode_size` says, and its last `info` has gym-gazebo2's
-    statistics under `infos`.
+    The environment itself truncates an episode, after 2048 steps or after the number of steps from `set_episode_size`.
+    The last `info` of an episode contains gym-gazebo2's statistics under `infos`.
 
     Args:
         task: the name of a task.
-        gui: open the viewer in the browser; -g of gym-gazebo2's scripts.
-        real_speed: joints that travel, and are not at their targets at once; -r.
-        velocity: how fast they travel, rad/s; -v.
-        original_observation: whether the velocity in the observation is what gym-gazebo2 has there, J(q)·q, the Jacobian
-            times the joint positions, by a slip; else the true J(q)·q̇.
-        **options: as of MaraEnv.
+        gui: show the arm in the browser; flag -g of gym-gazebo2's scripts.
+        real_speed: joints move with a limited speed, and do not jump to their targets; flag -r.
+        velocity: the joint speed with real_speed, rad/s; flag -v.
+        original_observation: whether the observation has J(q)·q, the Jacobian times the joint positions, in place of the
+            end effector's velocity J(q)·q̇. gym-gazebo2 has this error.
+        **options: as in MaraEnv.
 
     Raises:
-        GymMaraError: as of MaraEnv; or an option says something of Gazebo alone.
+        GymMaraError: as in MaraEnv, or an option only concerns Gazebo.
     """
 
     def __init__(
@@ -56,57 +58,58 @@ class GazeboMaraEnv(MaraEnv):
         original_observation: bool = False,
         **options: Any,
     ) -> None:
-        for flag, instead in _NO_MEANING.items():
+        for flag, reason in _NO_MEANING.items():
             if flag in options:
-                raise GymMaraError(f"{flag!r} has no meaning here: {instead}; leave it out")
+                raise GymMaraError(f"{flag!r} has no meaning here: {reason}; leave it out")
         if velocity is not None and not real_speed:
-            raise GymMaraError("'velocity' is that of joints that travel: give real_speed=True too")
+            raise GymMaraError(
+                "'velocity' has no effect without real_speed: give real_speed=True too"
+            )
         if real_speed:
             speed = RUN_VELOCITY if velocity is None else velocity
             options["max_joint_velocity"] = positive_number("velocity", speed, "rad/s")
         if gui:
             options["render_mode"] = "human"
         super().__init__(task, **options)
-        self._episode_size = 2048
-        self._slip = original_observation
+        self._episode_size = MAX_EPISODE_STEPS
         if original_observation:
-            robot, space = self.simulation.robot, self.simulation.observation_space
-            # No part of the arm is farther along than each joint's reach times its angle.
-            farthest = float((robot.reach * np.maximum(-robot.lower, robot.upper)).sum())
-            low, high = space.low.copy(), space.high.copy()
-            low[-3:], high[-3:] = -farthest, farthest
-            self.observation_space = Box(low, high, dtype=np.float64)
-            self._kinematics = robot.kinematics()
+            replacement = _position_for_velocity(self.simulation.robot)
+            parts = self.simulation.observation.parts
+            self.simulation.observation = Observation(
+                [replacement if part.name == replacement.name else part for part in parts]
+            )
+            self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
 
     def set_episode_size(self, episode_size: int) -> None:
-        """End episodes after so many steps, from this one on."""
+        """Set the length of the current and all later episodes, steps."""
         self._episode_size = whole_number("episode_size", episode_size)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start pose."""
-        observation, info = super().reset(seed=seed, options=options)
-        return self._as_original(observation), info
-
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Move towards the joint targets (J,), rad, for one control period.
+        """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
+            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
         """
         observation, reward, terminated, truncated, info = super().step(action)
         statistics = info["statistics"]
         truncated = truncated or statistics["ep_steps"] >= self._episode_size
         if terminated or truncated:
             info["infos"] = {name: v for name, v in statistics.items() if name != "ep_steps"}
-        return self._as_original(observation), reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
-    def _as_original(self, observation: Floats) -> Floats:
-        if self._slip:
-            q = observation[None, : self.simulation.robot.num_joints]
-            observation[-3:] = self._kinematics.velocity(q, q)[0]
-        return observation
+
+def _position_for_velocity(robot: RobotModel) -> Part:
+    """The part that gym-gazebo2 has in place of the end effector's velocity: J(q)·q, the Jacobian times the joint positions."""
+    # |J(q)·q| is at most the sum over the joints of reach times largest angle.
+    farthest = float((robot.reach * np.maximum(-robot.lower, robot.upper)).sum())
+    bound = np.full(3, farthest)
+    return Part(
+        "tool_velocity", -bound, bound, partial(_jacobian_times_position, robot.kinematics())
+    )
+
+
+def _jacobian_times_position(kinematics: Kinematics, state: SimState, goal: Goal) -> Floats:
+    return kinematics.velocity(state.q, state.q)
 
 
 for _name in PAPER_TASKS:

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 
 from gym_mara import rotations
 from gym_mara.envs.single import MaraEnv
 from gym_mara.errors import GymMaraError, positive_number, unknown
-from gym_mara.tasks import Goal, ReachTask, Task
+from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
+from gym_mara.types import Floats
 
-Floats = NDArray[np.float64]
 REWARD_TYPES = ("sparse", "dense")
 
 
@@ -54,24 +54,32 @@ class MaraGoalEnv(MaraEnv):
         if not isinstance(self.simulation.task, ReachTask):
             raise GymMaraError(f"a goal environment wants a reach task, not {task!r}")
         self.task = self.simulation.task
-        joints = self.simulation.robot.num_joints
-        after_errors = joints + (7 if self.task.orientation else 3)
-        self._own = np.r_[0:joints, after_errors : after_errors + 3]
-        flat = self.simulation.observation_space
-        own = Box(flat.low[self._own], flat.high[self._own], dtype=np.float64)
-        extent, one = self.simulation.robot.extent, 1.0 + 1e-9
-        low, high = [-extent] * 3, [extent] * 3
+        robot, backend = self.simulation.robot, self.simulation.backend
+        self._groups: dict[str, list[Part]] = {
+            "observation": [
+                observation.joint_positions(robot),
+                observation.tool_velocity(robot, backend.joint_velocity),
+            ],
+            "achieved_goal": [observation.tool_position(robot)],
+            "desired_goal": [observation.target_position(robot)],
+        }
         if self.task.orientation:
-            low, high = [*low, 0.0, *[-one] * 3], [*high, *[one] * 4]
-        goal = Box(np.array(low), np.array(high), dtype=np.float64)
-        self.observation_space = Dict(observation=own, achieved_goal=goal, desired_goal=goal)  # type: ignore[assignment]
+            self._groups["achieved_goal"].append(observation.tool_quaternion())
+            self._groups["desired_goal"].append(observation.target_quaternion())
+        self.simulation.observation = Observation(
+            [part for parts in self._groups.values() for part in parts]
+        )
+        spaces: dict[str, Space[Any]] = {
+            name: Observation(parts).space for name, parts in self._groups.items()
+        }
+        self.observation_space = Dict(spaces)  # type: ignore[assignment]
 
     def reset(  # type: ignore[override]
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Floats], dict[str, Any]]:
         """Begin an episode at the start pose."""
-        observation, info = super().reset(seed=seed, options=options)
-        return self._as_goals(observation), info
+        flat, info = super().reset(seed=seed, options=options)
+        return self._as_goals(flat), info
 
     def step(  # type: ignore[override]
         self, action: NDArray[np.float32]
@@ -82,11 +90,11 @@ class MaraGoalEnv(MaraEnv):
             GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
         """
         flat, _, terminated, truncated, info = super().step(action)
-        observation = self._as_goals(flat)
-        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        goals = self._as_goals(flat)
+        achieved, desired = goals["achieved_goal"], goals["desired_goal"]
         info["is_success"] = bool(self._succeeds(achieved, desired))
         reward = float(self.compute_reward(achieved, desired, info))
-        return observation, reward, terminated, truncated, info
+        return goals, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
         """The rewards (...,) of achieved goals (..., G) for desired goals (..., G).
@@ -137,17 +145,9 @@ class MaraGoalEnv(MaraEnv):
         return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
 
     def _as_goals(self, flat: Floats) -> dict[str, Floats]:
-        """The task's observation (O,) as one with goals."""
-        joints = self.simulation.robot.num_joints
-        goal = self.simulation.goal
-        achieved = [flat[joints : joints + 3] + goal.position[0]]
-        desired = [goal.position[0]]
-        if self.task.orientation:
-            error = flat[joints + 3 : joints + 7]
-            achieved.append(rotations.canonical(rotations.multiply(error, goal.quaternion[0])))
-            desired.append(goal.quaternion[0])
+        """The flat observation (O,) as a dictionary."""
+        values = self.simulation.observation.split(flat)
         return {
-            "observation": flat[self._own],
-            "achieved_goal": np.concatenate(achieved),
-            "desired_goal": np.concatenate(desired),
+            name: np.concatenate([values[part.name] for part in parts])
+            for name, parts in self._groups.items()
         }

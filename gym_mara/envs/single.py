@@ -10,16 +10,18 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.envs.simulation import Simulation, report
+from gym_mara.envs.options import Options
+from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.streams import Streams
+from gym_mara.envs.view import view_of
 from gym_mara.errors import unknown
-from gym_mara.rendering import Pictures, RenderSettings
+from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import Task
+from gym_mara.types import Floats
 
 if TYPE_CHECKING:
     from gym_mara.viewer.viewer import Viewer
-
-Floats = NDArray[np.float64]
 
 
 class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
@@ -35,7 +37,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         backend: the name of a backend.
         render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
         **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
-            (`max_joint_velocity`, …) and of pictures (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`).
+            (`max_joint_velocity`, …), of the sensors (`velocity_filter`) and of pictures (`width`, `camera`, …;
+            `gym_mara.rendering.RenderSettings`).
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
@@ -55,12 +58,13 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         **options: Any,
     ) -> None:
         self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
-        self._rendering, options = RenderSettings.split(options)
-        others = RenderSettings.names()
-        self.simulation = Simulation(task, 1, robot, ee_frame, backend, options, others)
-        self._pictures = Pictures(self.simulation.robot, self._rendering)
+        self._options = Options.sort(task, robot, ee_frame, backend, options)
+        self.simulation = Simulation(self._options, 1)
+        self._pictures = Pictures(self.simulation.robot, self._options.rendering)
         self.viewer: Viewer | None = None
-        self.observation_space = self.simulation.observation_space  # type: ignore[assignment]
+        # The generator that the simulation's streams were spawned from.
+        self._spawned_from: np.random.Generator | None = None
+        self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
         self.action_space = self.simulation.action_space
         self.metadata = self.metadata | {"render_fps": 1.0 / self.simulation.backend.control_period}
 
@@ -69,10 +73,13 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode at the start pose; `options` has no meaning yet."""
         super().reset(seed=seed)
-        observation = self.simulation.reset((self.np_random,))[0]
+        if self._spawned_from is not self.np_random:
+            self._spawned_from = self.np_random
+            self.simulation.streams = (Streams.of(self.np_random),)
+        observation, report = self.simulation.reset()
         if self.render_mode == "human":
             self._show()
-        return observation, _info_of_one(report(self.simulation.backend.state))
+        return observation[0], _info_of_one(report)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move towards the joint targets (J,), rad, for one control period.
@@ -80,17 +87,16 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         Raises:
             GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
         """
-        targets: Any = np.asarray(action)[None]
-        if self.viewer is not None:
-            targets = self.viewer.before_step(self.simulation, targets)
-        outcome = self.simulation.step(targets)
-        if self.viewer is not None:
-            self.viewer.after_step(self.simulation, outcome)
+        outcome = self._advance(np.asarray(action)[None])
         info = _info_of_one(outcome.info)
         # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
         return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
+
+    def _advance(self, targets: NDArray[Any]) -> Outcome:
+        """Step the simulation; the viewer does so at its own pace, and may have other targets."""
+        return self.simulation.step(targets) if self.viewer is None else self.viewer.step(targets)
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The picture of what the last observation shows, uint8 (height, width, 3); None but for "rgb_array".
@@ -102,27 +108,28 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             gymnasium.logger.warn("render() draws nothing: give render_mode='rgb_array' or 'human'")
         if self.render_mode != "rgb_array":
             return None
-        return self._pictures.of(self.simulation.view(0))
+        return self._pictures.of(view_of(self.simulation, 0))
 
     def _show(self) -> None:
         """Show the arm in the viewer, which is made when the first episode begins."""
         if self.viewer is None:
             from gym_mara.viewer.viewer import Viewer
 
-            self.viewer = Viewer(self.simulation, self._rendering)
-        self.viewer.show(self.simulation)
+            self.viewer = Viewer(self.simulation, self._options.rendering)
+        self.viewer.show()
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"viewer": None}  # a copy gets its own when it is reset
 
     def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arm, the episode and the random generator; it pickles."""
+        """A snapshot of the arm, the episode and the random generators; it pickles."""
         return self.simulation.save() | {"np_random": copy.deepcopy(self.np_random)}
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
         """Go back to a snapshot of an environment made alike."""
         self.simulation.restore(snapshot)
         self.np_random = copy.deepcopy(snapshot["np_random"])
+        self._spawned_from = self.np_random if self.simulation.streams else None
 
     def close(self) -> None:
         """Free the backend, the renderer and the viewer."""

@@ -7,25 +7,27 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.envs.simulation import Mask, Simulation, report
+from gym_mara.envs.options import Options
+from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.single import checked_render_mode
+from gym_mara.envs.streams import Streams
+from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, unknown, whole_number
-from gym_mara.rendering import Pictures, RenderSettings
+from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
-from gym_mara.tasks import Task
-
-Floats = NDArray[np.float64]
+from gym_mara.tasks import MAX_EPISODE_STEPS, Task
+from gym_mara.types import Floats, Mask
 
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     """N arms in one batch: the numbers of N MaraEnvs, at a fraction of the time.
 
-    `info` is MaraEnv's in Gymnasium's form for vectors, with `statistics` at the last step of an episode.
+    `info` is MaraEnv's in Gymnasium's form for vectors, with `statistics` at the last step of an episode. Keys that hold
+    values of the same arms share one mask.
 
     Args:
         num_envs: N.
@@ -48,7 +50,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         ee_frame: str | None = None,
         backend: str = "pinocchio",
         render_mode: str | None = None,
-        max_episode_steps: int | None = 2048,
+        max_episode_steps: int | None = MAX_EPISODE_STEPS,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
@@ -56,11 +58,10 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
-        rendering, options = RenderSettings.split(options)
-        others = RenderSettings.names()
-        self.simulation = Simulation(task, num_envs, robot, ee_frame, backend, options, others)
+        sorted_options = Options.sort(task, robot, ee_frame, backend, options)
+        self.simulation = Simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
-        self.single_observation_space = self.simulation.observation_space
+        self.single_observation_space = self.simulation.observation.space
         self.single_action_space = self.simulation.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -71,9 +72,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "render_fps": 1.0 / self.simulation.backend.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._pictures = Pictures(self.simulation.robot, rendering)
+        self._pictures = Pictures(self.simulation.robot, sorted_options.rendering)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
-        self._generators: tuple[np.random.Generator, ...] = ()  # where episodes are random
         self.closed = False
 
     def reset(
@@ -82,7 +82,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin episodes, of all arms or of those that `options["reset_mask"]`, bool (N,), names."""
+        """Begin episodes, of all arms or of those that `options["reset_mask"]`, bool (N,), chooses."""
         seeds: Sequence[int | None] = [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + index for index in range(self.num_envs)]
@@ -102,16 +102,16 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self._ended[chosen] = False
         if self.simulation.random:
             self._seed(seeds, chosen)
-        observation = self.simulation.reset(self._generators, mask)
-        return observation, _vector_info(report(self.simulation.backend.state), chosen)
+        observation, report = self.simulation.reset(mask)
+        return observation, _vector_info(report, chosen)
 
     def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
-        """Give each arm a random generator of its own, the one that a MaraEnv has with the arm's seed."""
-        generators = dict(enumerate(self._generators))
+        """Give each arm its own streams, those that a MaraEnv has with the arm's seed."""
+        streams = dict(enumerate(self.simulation.streams))
         for index, seed in enumerate(seeds):
-            if index not in generators or (chosen[index] and seed is not None):
-                generators[index] = np_random(seed)[0]
-        self._generators = tuple(generators[index] for index in range(self.num_envs))
+            if index not in streams or (chosen[index] and seed is not None):
+                streams[index] = Streams.seeded(seed)
+        self.simulation.streams = tuple(streams[index] for index in range(self.num_envs))
 
     def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
@@ -119,12 +119,6 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         Raises:
             GymMaraError: the actions have the wrong shape or are not finite; no arm has moved then.
         """
-        return self.advance(actions, with_info=True)
-
-    def advance(
-        self, actions: ArrayLike, with_info: bool
-    ) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
-        """`step`, by choice without an `info` but where an episode ends or begins: that spares a learner its making."""
         resetting = self._ended
         some_reset = bool(np.count_nonzero(resetting))
         if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
@@ -136,41 +130,47 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         truncated = self.simulation.statistics.steps == self.max_episode_steps
         if outcome.truncated is not None:
             truncated |= outcome.truncated
-        if some_reset:  # NEXT_STEP: these began an episode instead of stepping
-            observation[resetting] = self._reset(resetting)[resetting]
-            reward[resetting] = 0.0
-            terminated, truncated = terminated & ~resetting, truncated & ~resetting
-        ended = terminated | truncated
-        some_ended = bool(np.count_nonzero(ended))
-        info: dict[str, Any] = {}
-        if with_info or some_ended or some_reset:
-            info = _vector_info(outcome.info, ~resetting)
+        stepped = ~resetting
+        if some_reset:  # NEXT_STEP: these begin an episode instead of stepping
+            first, report = self.simulation.reset(resetting)
+            observation = np.where(resetting[:, None], first, observation)
+            reward = np.where(resetting, 0.0, reward)
+            terminated, truncated = terminated & stepped, truncated & stepped
+        info = _vector_info(outcome.info, stepped)
         if some_reset:
-            self._report_beginning(info, resetting)
-        if some_ended:
+            _add_rows(info, report, resetting)
+        ended = terminated | truncated
+        if np.count_nonzero(ended):
             info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                final = np.full(self.num_envs, None, dtype=object)
-                for index in np.flatnonzero(ended):
-                    final[index] = observation[index].copy()
-                final_info = {"final_info": {k: v for k, v in info.items() if k[0] != "_"}}
-                info = _vector_info(outcome.info, ~ended)
-                info |= {"final_obs": final, "_final_obs": ended.copy()}
-                info |= _vector_info(final_info, ended)
-                observation[ended] = self._reset(ended)[ended]
-                self._report_beginning(info, ended)
+                observation, info = self._begin_next(outcome, info, ended)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended.copy()
         return observation, reward, terminated, truncated, info
 
-    def _reset(self, arms: Mask) -> Floats:
-        return self.simulation.reset(self._generators, arms)
+    def _begin_next(
+        self, outcome: Outcome, final: dict[str, Any], ended: Mask
+    ) -> tuple[Floats, dict[str, Any]]:
+        """SAME_STEP: begin the next episodes of the arms (N,) whose episodes have ended.
 
-    def _report_beginning(self, info: dict[str, Any], began: Mask) -> None:
-        """Enter what the backend says of arms whose episodes have just begun."""
-        for key, values in report(self.simulation.backend.state).items():
-            info[key][began] = values[began]
-            info[f"_{key}"][began] = True
+        Args:
+            outcome: of the step.
+            final: its info in Gymnasium's form, with the statistics.
+            ended: which arms.
+
+        Returns:
+            The observations (N, O), of those arms the first of their new episodes, and the info.
+        """
+        last = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended):
+            last[index] = outcome.observation[index].copy()
+        info = _vector_info(outcome.info, ~ended)
+        info |= {"final_obs": last, "_final_obs": ended}
+        final = {key: value for key, value in final.items() if key[0] != "_"}
+        info |= _vector_info({"final_info": final}, ended)
+        first, report = self.simulation.reset(ended)
+        _add_rows(info, report, ended)
+        return np.where(ended[:, None], first, outcome.observation), info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture of each arm, of what its last observation shows; None without a render_mode.
@@ -180,14 +180,14 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """
         if self.render_mode is None:
             return None
-        return tuple(self._pictures.of(self.simulation.view(arm)) for arm in range(self.num_envs))
+        arms = range(self.num_envs)
+        return tuple(self._pictures.of(view_of(self.simulation, arm)) for arm in arms)
 
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arms, the episodes and the random generators; it pickles."""
         return self.simulation.save() | {
             "ended": self._ended.copy(),
             "np_random": copy.deepcopy(self.np_random),
-            "generators": copy.deepcopy(self._generators),
         }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
@@ -195,7 +195,6 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.simulation.restore(snapshot)
         self._ended = snapshot["ended"].copy()
         self.np_random = copy.deepcopy(snapshot["np_random"])
-        self._generators = copy.deepcopy(snapshot["generators"])
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the backend and the renderer; called by close()."""
@@ -211,18 +210,29 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
-    """Gymnasium's form of a batch of infos: a mask `_key` beside each key says which arms it speaks of."""
+    """Gymnasium's form of a batch of infos: a mask `_key` beside each key tells which arms have a value."""
     info: dict[str, Any] = {}
-    all_arms = np.count_nonzero(mask) == len(mask)
+    everyone = np.count_nonzero(mask) == len(mask)
     for key, value in values.items():
         if isinstance(value, dict):
             nested = {k: v for k, v in value.items() if not k.startswith("_")}
             info[key] = _vector_info(nested, mask)
-        elif all_arms:
-            info[key] = value.copy()
+        elif everyone:
+            info[key] = value
         else:
-            rows = mask.reshape(-1, *(1,) * (value.ndim - 1))
             absent = np.array(None) if value.dtype == object else np.zeros((), value.dtype)
-            info[key] = np.where(rows, value, absent)
-        info[f"_{key}"] = mask.copy()
+            info[key] = np.where(_rows(mask, value), value, absent)
+        info[f"_{key}"] = mask
     return info
+
+
+def _add_rows(info: dict[str, Any], values: dict[str, NDArray[Any]], arms: Mask) -> None:
+    """Enter the values of some arms into an info that holds those of others."""
+    for key, value in values.items():
+        info[key] = np.where(_rows(arms, value), value, info[key])
+        info[f"_{key}"] = info[f"_{key}"] | arms
+
+
+def _rows(mask: Mask, value: NDArray[Any]) -> Mask:
+    """A mask (N,) that broadcasts against values (N, …)."""
+    return mask.reshape(-1, *(1,) * (value.ndim - 1))

@@ -8,40 +8,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
-from gym_mara.rendering.look import Look
+from gym_mara.rendering.camera import Camera
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
 
 Picture = NDArray[np.uint8]
 """(height, width, 3), RGB."""
 
 
 class NoDisplayError(GymMaraError):
-    """A renderer is installed, but nothing here lets it draw."""
+    """A renderer is installed, but it finds no way to draw on this machine."""
 
 
 class Renderer(ABC):
-    """Draws the views of one scene, seen from one place.
+    """Draws the views of one scene from one camera.
 
     Args:
-        scene: what there is to see.
-        look: from where.
+        scene: the parts to draw.
+        camera: the camera.
         settings: the size of the pictures.
-        first: a view, to see what stands where.
+        first: a view that shows where the fixed parts are.
 
     Raises:
-        NoDisplayError: it cannot draw on this machine.
+        NoDisplayError: the renderer cannot draw on this machine.
     """
 
-    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
+    def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
         self.scene = scene
-        self.look = look
+        self.camera = camera
         self.width, self.height = settings.width, settings.height
 
     @abstractmethod
     def render(self, view: View) -> Picture:
-        """The picture of a view, a fresh array."""
+        """Draw a view; the picture is a fresh array."""
 
-    def close(self) -> None:  # noqa: B027 - some have nothing to free
-        """Free what it holds; nothing else is called afterwards."""
+    def close(self) -> None:  # noqa: B027 - some renderers have nothing to free
+        """Free the renderer's resources. No other method is called afterwards."""

@@ -1,4 +1,4 @@
-"""What there is to see: the shapes of an arm and its surroundings, its target and tool, where they are, in what colour."""
+"""The parts of a scene, their poses and colours: the arm, its surroundings, and the frames of target and tool."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from gym_mara.extras import needs
+from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
-from gym_mara.state import View
+from gym_mara.types import Floats
 
 with needs("rendering", "render", "trimesh"):
     import trimesh
 
-Floats = NDArray[np.float64]
 Colour = tuple[float, float, float]
 
 COLLIDING: Colour = (0.86, 0.10, 0.08)
-"""What a link that collides is painted."""
+"""The colour of links that collide."""
 _AXES: tuple[Colour, ...] = ((0.90, 0.16, 0.16), (0.18, 0.66, 0.22), (0.16, 0.36, 0.90))
-_PLAIN: Colour = (0.7, 0.7, 0.72)
-_ROUND = 48
-"""How many sides stand for a circle."""
+_DEFAULT: Colour = (0.7, 0.7, 0.72)
+"""The colour of a mesh whose file has none."""
+_CIRCLE_SIDES = 48
+"""The number of sides of the polygon that approximates a circle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,28 +34,28 @@ class Part:
 
     name: str
     link: str
-    """The link that it belongs to; "target" and "tool" are the frames drawn there."""
+    """The link that the part belongs to; "target" or "tool" for a frame that is drawn there."""
     vertices: NDArray[np.float32]
-    """(V, 3), m, in a frame of its own."""
+    """Vertex positions in the part's own frame (V, 3), m."""
     normals: NDArray[np.float32]
-    """(V, 3), outwards."""
+    """Outward unit normals at the vertices (V, 3)."""
     faces: NDArray[np.int32]
-    """(F, 3), indices of vertices."""
+    """Triangles (F, 3), as indices of vertices."""
     colour: Colour
-    """In [0, 1]."""
+    """RGB in [0, 1]."""
     fixed: bool = False
-    """Whether it never moves."""
+    """Whether the part never moves."""
     marker: bool = False
-    """Whether it is a drawing and no body."""
+    """Whether the part is only drawn, and is no physical body."""
 
     def placed(self, placement: Floats) -> NDArray[np.float32]:
-        """The vertices (V, 3) in the world frame, m, where a homogeneous matrix (4, 4) places the part."""
+        """The vertices in the world frame (V, 3), m, for a part with this pose, a homogeneous matrix (4, 4)."""
         rotation, position = placement[:3, :3].astype(np.float32), placement[:3, 3]
         return self.vertices @ rotation.T + position.astype(np.float32)
 
 
 class Scene:
-    """The parts of a robot's scene, and where each of them is.
+    """The parts of a robot's scene, with their poses and colours.
 
     Args:
         robot: the arm.
@@ -70,19 +71,19 @@ class Scene:
         self._geometry = robot.visual
         self._geometry_data = self._geometry.createData()
         parts: list[Part] = []
-        self._placed_by: list[int] = []
+        self._geometry_index: list[int] = []
         for index, shape in enumerate(self._geometry.geometryObjects):
             link = str(self._model.frames[shape.parentFrame].name)
             for mesh, colour in _meshes_of(shape):
                 name = f"{shape.name}/{len(parts)}"
                 parts.append(_part(name, link, mesh, colour, fixed=shape.parentJoint == 0))
-                self._placed_by.append(index)
-        self._bodies = len(parts)
+                self._geometry_index.append(index)
+        self._num_bodies = len(parts)
         parts += _frame("target", 0.14, 0.006) + _frame("tool", 0.09, 0.003)
         self.parts: tuple[Part, ...] = tuple(parts)
 
     def placements(self, view: View) -> Floats:
-        """Where each part is: its frame in the world frame, homogeneous matrices (P, 4, 4)."""
+        """The pose of each part in the world frame, homogeneous matrices (P, 4, 4)."""
         pin.forwardKinematics(self._model, self._data, view.q)
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data)
         tool = pin.updateFramePlacement(self._model, self._data, self.robot.ee_frame_id)
@@ -90,19 +91,19 @@ class Scene:
         target = np.eye(4)
         target[:3, :3] = pin.Quaternion(*view.target_quaternion).matrix()
         target[:3, 3] = view.target_position
-        of_part = {"target": target, "tool": tool.homogeneous}
-        markers = [of_part[part.link] for part in self.parts[self._bodies :]]
-        return np.array([bodies[index] for index in self._placed_by] + markers)
+        frames = {"target": target, "tool": tool.homogeneous}
+        markers = [frames[part.link] for part in self.parts[self._num_bodies :]]
+        return np.array([bodies[index] for index in self._geometry_index] + markers)
 
     def colours(self, view: View) -> list[Colour]:
-        """The colour of each part; of a link that collides it is red."""
+        """The colour of each part; links that collide are red."""
         return [
             COLLIDING if part.link in view.touching and not part.marker else part.colour
             for part in self.parts
         ]
 
     def bounds(self, view: View, *, moving: bool = True) -> tuple[Floats, Floats]:
-        """The lowest and the highest corner (3,), m, of what moves, or of everything, the target included."""
+        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts; the target is included."""
         corners = [view.target_position[None].astype(np.float32)]
         for part, placement in zip(self.parts, self.placements(view), strict=True):
             if not part.marker and not (moving and part.fixed):
@@ -112,7 +113,7 @@ class Scene:
 
 
 def _meshes_of(shape: pin.GeometryObject) -> list[tuple[trimesh.Trimesh, Colour]]:
-    """The meshes of a visual of a URDF, in its frame, each with its colour."""
+    """The meshes of a URDF visual, in its frame, each with its colour."""
     red, green, blue, _ = np.asarray(shape.meshColor, float).tolist()
     own: Colour = (red, green, blue)
     primitive = _primitive(shape.geometry)
@@ -123,14 +124,14 @@ def _meshes_of(shape: pin.GeometryObject) -> list[tuple[trimesh.Trimesh, Colour]
         if isinstance(mesh, trimesh.Trimesh):
             mesh.apply_scale(np.asarray(shape.meshScale))
             colour = own if shape.overrideMaterial else _colour_of(mesh)
-            # The other formats say where a surface is smooth.
+            # STL stores no vertex normals, so creases are found by angle; the other formats store them.
             is_stl = shape.meshPath.lower().endswith(".stl")
             found.append((_with_creases(mesh) if is_stl else mesh, colour))
     return found
 
 
 def _primitive(geometry: Any) -> trimesh.Trimesh | None:
-    """The mesh of one of a URDF's own shapes; None for a mesh from a file."""
+    """The mesh of a URDF primitive; None if the shape is a mesh file."""
     kind = type(geometry).__name__
     if kind == "Box":
         return trimesh.creation.box(2.0 * np.asarray(geometry.halfSide))
@@ -138,28 +139,30 @@ def _primitive(geometry: Any) -> trimesh.Trimesh | None:
         return trimesh.creation.icosphere(subdivisions=3, radius=geometry.radius)
     if kind == "Cylinder":
         height = 2.0 * geometry.halfLength
-        return trimesh.creation.cylinder(geometry.radius, height, sections=_ROUND)
+        return trimesh.creation.cylinder(geometry.radius, height, sections=_CIRCLE_SIDES)
     if kind == "Capsule":
         height = 2.0 * geometry.halfLength
-        mesh = trimesh.creation.capsule(height, geometry.radius, count=(_ROUND, _ROUND))
+        mesh = trimesh.creation.capsule(
+            height, geometry.radius, count=(_CIRCLE_SIDES, _CIRCLE_SIDES)
+        )
         mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
         return mesh
     return None
 
 
 def _with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with its vertices doubled along sharp edges, so that normals do not run round them."""
+    """The mesh with its vertices duplicated along sharp edges, so that normals are not averaged across them."""
     return trimesh.graph.smooth_shade(mesh, angle=np.radians(30.0))
 
 
 def _colour_of(mesh: Any) -> Colour:
-    """The colour that a mesh's file gives it."""
+    """The colour that the mesh file defines."""
     if mesh.visual.kind == "texture":
         rgba = np.asarray(mesh.visual.material.main_color, float)
     elif mesh.visual.kind in ("face", "vertex"):
         rgba = np.asarray(mesh.visual.main_color, float)
     else:
-        return _PLAIN
+        return _DEFAULT
     red, green, blue = (rgba[:3] / 255.0).tolist()
     return red, green, blue
 
@@ -186,7 +189,7 @@ def _part(
 
 
 def _frame(link: str, length: float, radius: float) -> list[Part]:
-    """A frame drawn as three rods along x, y and z, red, green and blue."""
+    """A coordinate frame, drawn as three rods: x red, y green, z blue."""
     parts = []
     for axis, colour in enumerate(_AXES):
         ends = np.zeros((2, 3))

@@ -1,18 +1,17 @@
-"""What a user may choose of pictures and of the viewer."""
+"""The settings of pictures and of the viewer."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
 
 RENDERERS = ("vtk", "raycast")
-"""The nicer one first."""
-# From where a camera looks at the middle of the scene: azimuth and elevation, deg.
+"""In the order of preference."""
+# The direction from the middle of the scene to each camera: azimuth and elevation, deg.
 CAMERAS = {
     "three_quarter": (208.0, 20.0),
     "front": (180.0, 6.0),
@@ -24,23 +23,24 @@ _HIGHEST = {"width": 4096, "height": 4096, "viewer_port": 65535}
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What a user may choose of pictures and of the viewer; each is a keyword argument of the environments.
+    """The settings of pictures and of the viewer; each is a keyword argument of the environments.
 
     Raises:
-        GymMaraError: a value is of the wrong form or out of its range.
+        GymMaraError: a value has the wrong form or is out of its range.
     """
 
     width: int = 640
-    """Of a picture, pixels."""
+    """The width of a picture, pixels."""
     height: int = 480
+    """The height of a picture, pixels."""
     camera: str | tuple[tuple[float, ...], tuple[float, ...]] = "three_quarter"
-    """The name of a camera, or where it is and the point that it looks at, each [x, y, z], m."""
+    """The name of a camera, or its position and the point that it looks at, each [x, y, z], m, in the world frame."""
     renderer: str | None = None
-    """"vtk" or "raycast"; None for the first of them that works on this machine."""
+    """"vtk" or "raycast"; None for the first one that works on this machine."""
     viewer_host: str = "127.0.0.1"
     """The address that the viewer listens on."""
     viewer_port: int = 8080
-    """The port that it listens on; if that is in use, the next one that is free."""
+    """The port that the viewer listens on; if it is in use, the next free port."""
 
     def __post_init__(self) -> None:
         for name, highest in _HIGHEST.items():
@@ -53,18 +53,6 @@ class RenderSettings:
         elif self.camera not in CAMERAS:
             raise unknown("camera", self.camera, CAMERAS)
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """The keyword arguments."""
-        return tuple(field.name for field in fields(cls))
-
-    @classmethod
-    def split(cls, options: dict[str, Any]) -> tuple[RenderSettings, dict[str, Any]]:
-        """The settings among keyword arguments, and what else there is among them."""
-        names = cls.names()
-        chosen = {name: value for name, value in options.items() if name in names}
-        return cls(**chosen), {k: v for k, v in options.items() if k not in names}
-
 
 def _two_points(camera: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
     try:
@@ -74,6 +62,6 @@ def _two_points(camera: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], .
     if points.shape != (2, 3) or not np.isfinite(points).all() or (points[0] == points[1]).all():
         raise GymMaraError(
             f"camera must be one of {', '.join(CAMERAS)}, or two points [[x, y, z], [x, y, z]], m: "
-            f"where it is and what it looks at; not {camera!r}"
+            f"its position and the point that it looks at; not {camera!r}"
         )
     return tuple(map(tuple, points.tolist()))

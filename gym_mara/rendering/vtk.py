@@ -1,4 +1,4 @@
-"""Pictures by VTK, on a GPU or in software, with or without a display."""
+"""The renderer "vtk": OpenGL on a GPU or in software, with or without a display."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gym_mara.extras import needs
-from gym_mara.rendering.look import (
+from gym_mara.rendering.camera import (
     AMBIENT,
     BACKGROUND,
     FILL,
     FLOOR,
     KEY,
-    SHADE,
-    SHINE,
-    TO_LAMP,
+    SHADOW,
+    SPECULAR,
+    TO_KEY_LIGHT,
     VIEW_ANGLE,
-    Look,
+    Camera,
     floor_colour,
     shaded,
 )
 from gym_mara.rendering.renderer import NoDisplayError, Picture, Renderer
-from gym_mara.rendering.scene import Floats, Part, Scene
+from gym_mara.rendering.scene import Part, Scene
 from gym_mara.rendering.settings import RenderSettings
-from gym_mara.state import View
+from gym_mara.rendering.view import View
+from gym_mara.types import Floats
 
 with needs("the renderer 'vtk'", "render", "pyvista"):
     import pyvista
@@ -36,8 +37,8 @@ with needs("the renderer 'vtk'", "render", "pyvista"):
     from vtkmodules.vtkCommonDataModel import vtkPlane
 
 _SAMPLES = 4
-# Draws nothing, and ends well where VTK could draw; where it cannot, VTK may take its process along.
-_PROBE = """
+# Exits with 0 if VTK can draw. It runs in a process of its own, because VTK may crash where it finds no OpenGL.
+_OPENGL_PROBE = """
 import sys
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
@@ -47,44 +48,49 @@ window.SetSize(8, 8)
 window.Render()
 sys.exit(not window.SupportsOpenGL())
 """
-_ABOVE = 0.0015
-"""How high a shadow lies above what it falls on, m."""
+_SHADOW_OFFSET = 0.0015
+"""The height of a shadow above its receiver, which avoids z-fighting, m."""
 
 
 class _Shadow(NamedTuple):
-    """The shadow of a part on a horizontal plane."""
+    """The shadow of a part on the floor or on the top of a box."""
 
     caster: int
-    """The number of the part."""
+    """The index of the part that casts the shadow."""
     receiver: int | None
-    """The number of the part that it falls on; None for the floor."""
+    """The index of the part that the shadow falls on; None for the floor."""
     actor: Any
+    """The shadow's VTK actor."""
     projection: Floats
-    """Along the lamp's light onto the plane (4, 4)."""
+    """The projection along the key light's direction onto the plane (4, 4)."""
 
 
 class VtkRenderer(Renderer):
-    """VTK's rasteriser, with shadows that are the parts themselves, flattened along the lamp's light."""
+    """VTK's rasteriser. A shadow is a copy of its part, projected along the key light onto a horizontal plane."""
 
-    def __init__(self, scene: Scene, look: Look, settings: RenderSettings, first: View) -> None:
-        super().__init__(scene, look, settings, first)
+    def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
+        super().__init__(scene, camera, settings, first)
         if not _has_opengl():
             raise NoDisplayError(
-                "VTK finds no OpenGL to draw with: install EGL or OSMesa (Debian: libegl1 with libgl1-mesa-dri, "
+                "VTK finds no OpenGL: install EGL or OSMesa (Debian: libegl1 with libgl1-mesa-dri, "
                 "or libosmesa6), or choose renderer='raycast'"
             )
-        vtkObject.GlobalWarningDisplayOff()  # it warns of every display that it tries and that is not there
+        vtkObject.GlobalWarningDisplayOff()  # VTK warns of each display that it cannot open
         size = [self.width, self.height]
         self._plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background(BACKGROUND)
         self._plotter.render_window.SetMultiSamples(_SAMPLES)
         self._meshes = [_polydata(part) for part in scene.parts]
-        self._actors = [self._add_part(*of) for of in zip(scene.parts, self._meshes, strict=True)]
-        towards = look.eye - look.at
-        self._left_in_shadow = AMBIENT + FILL * max(0.0, towards[2] / np.linalg.norm(towards))
+        self._actors = [
+            self._add_part(*pair) for pair in zip(scene.parts, self._meshes, strict=True)
+        ]
+        to_camera = camera.eye - camera.at
+        # A horizontal surface in shadow receives the ambient light and the fill light.
+        self._light_in_shadow = AMBIENT + FILL * max(0.0, to_camera[2] / np.linalg.norm(to_camera))
         self._shadows = self._add_shadows(scene.placements(first))
         self._add_floor()
-        self._light()
+        self._add_lights()
+        self._place_camera()
 
     def _add_part(self, part: Part, mesh: pyvista.PolyData) -> Any:
         return self._plotter.add_mesh(
@@ -92,49 +98,58 @@ class VtkRenderer(Renderer):
             color=part.colour,
             ambient=0.8 if part.marker else AMBIENT,
             diffuse=0.2 if part.marker else 1.0,
-            specular=0.0 if part.marker else SHINE,
+            specular=0.0 if part.marker else SPECULAR,
             specular_power=20.0,
             interpolation="phong",
             render=False,
         )
 
     def _add_shadows(self, placements: Floats) -> list[_Shadow]:
-        """Let everything cast its shadow on the floor, and on the boxes below it that stay where they are."""
+        """Add the shadows of all parts on the floor, and on the fixed boxes, such as a table, below them."""
         parts = self.scene.parts
-        boxes = [_box_around(part, m) for part, m in zip(parts, placements, strict=True)]
-        # What shadows fall on: its height, and the number of the box.
-        receivers: list[tuple[float, int | None]] = [(float(self.look.floor[2]), None)]
+        boxes = [_bounding_box(part, m) for part, m in zip(parts, placements, strict=True)]
+        # The height of each receiver, m, and the index of its part; None for the floor.
+        receivers: list[tuple[float, int | None]] = [(float(self.camera.floor[2]), None)]
         for index, (part, placement) in enumerate(zip(parts, placements, strict=True)):
-            if part.fixed and _fills(part, placement, boxes[index]):
+            if part.fixed and _is_box(part, placement, boxes[index]):
                 receivers.append((float(boxes[index][1, 2]), index))
         shadows = []
         for height, receiver in receivers:
             for caster, mesh in enumerate(self._meshes):
                 if parts[caster].fixed and boxes[caster][0, 2] < height - 1e-6:
                     continue
-                colour = shaded(FLOOR, SHADE)
+                colour = shaded(FLOOR, SHADOW)
                 actor = self._plotter.add_mesh(mesh, color=colour, lighting=False, render=False)
                 if receiver is not None:
                     _clip(actor, boxes[receiver])
-                shadows.append(_Shadow(caster, receiver, actor, _projection(height + _ABOVE)))
+                shadows.append(
+                    _Shadow(caster, receiver, actor, _projection(height + _SHADOW_OFFSET))
+                )
         return shadows
 
     def _add_floor(self) -> None:
-        """A disc that fades into the background."""
-        radius = self.look.floor_radius
+        """Add the floor, a disc that fades into the background."""
+        radius = self.camera.floor_radius
         disc = pyvista.Disc(
-            center=self.look.floor, inner=0.0, outer=radius, normal=(0, 0, 1), r_res=24, c_res=64
+            center=self.camera.floor, inner=0.0, outer=radius, normal=(0, 0, 1), r_res=24, c_res=64
         )
-        away = np.linalg.norm(disc.points[:, :2] - self.look.floor[:2], axis=1)
-        disc["colour"] = np.uint8(255.0 * floor_colour(away / radius))
+        distance = np.linalg.norm(disc.points[:, :2] - self.camera.floor[:2], axis=1)
+        disc["colour"] = np.uint8(255.0 * floor_colour(distance / radius))
         self._plotter.add_mesh(disc, scalars="colour", rgb=True, lighting=False, render=False)
 
-    def _light(self) -> None:
-        lamp = pyvista.Light(position=100.0 * TO_LAMP, focal_point=(0, 0, 0), intensity=KEY)
-        self._plotter.add_light(lamp)
+    def _add_lights(self) -> None:
+        position = 100.0 * TO_KEY_LIGHT
+        key = pyvista.Light(position=position, focal_point=(0, 0, 0), intensity=KEY)
+        self._plotter.add_light(key)
         self._plotter.add_light(pyvista.Light(light_type="headlight", intensity=FILL))
+
+    def _place_camera(self) -> None:
         camera = self._plotter.camera
-        camera.position, camera.focal_point, camera.up = self.look.eye, self.look.at, self.look.up
+        camera.position, camera.focal_point, camera.up = (
+            self.camera.eye,
+            self.camera.at,
+            self.camera.up,
+        )
         camera.view_angle = VIEW_ANGLE
         self._plotter.renderer.ResetCameraClippingRange()
         self._plotter.renderer.camera_set = True
@@ -147,7 +162,7 @@ class VtkRenderer(Renderer):
         for shadow in self._shadows:
             shadow.actor.user_matrix = shadow.projection @ placements[shadow.caster]
             if shadow.receiver is not None:
-                shadow.actor.prop.color = shaded(colours[shadow.receiver], self._left_in_shadow)
+                shadow.actor.prop.color = shaded(colours[shadow.receiver], self._light_in_shadow)
         window = self._plotter.render_window
         self._plotter.renderer.ResetCameraClippingRange()
         window.Render()
@@ -162,8 +177,8 @@ class VtkRenderer(Renderer):
 
 @functools.cache
 def _has_opengl() -> bool:
-    """Whether VTK can draw on this machine, tried in a process of its own."""
-    probe = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, check=False)
+    """Whether VTK can draw on this machine; a separate process tries it."""
+    probe = subprocess.run([sys.executable, "-c", _OPENGL_PROBE], capture_output=True, check=False)
     return probe.returncode == 0
 
 
@@ -173,21 +188,21 @@ def _polydata(part: Part) -> pyvista.PolyData:
     return mesh
 
 
-def _box_around(part: Part, placement: Floats) -> Floats:
-    """The lowest and the highest corner (2, 3) of the upright box around a part, m, in the world frame."""
+def _bounding_box(part: Part, placement: Floats) -> Floats:
+    """The lowest and the highest corner (2, 3) of a part's axis-aligned bounding box, m, in the world frame."""
     points = part.placed(placement)
     return np.array([points.min(axis=0), points.max(axis=0)], np.float64)
 
 
-def _fills(part: Part, placement: Floats, box: Floats) -> bool:
-    """Whether a part is the upright box around it."""
+def _is_box(part: Part, placement: Floats, box: Floats) -> bool:
+    """Whether a part has the shape of its axis-aligned bounding box."""
     points = part.placed(placement)
     at_corner = np.isclose(points, box[0], atol=1e-5) | np.isclose(points, box[1], atol=1e-5)
     return bool(at_corner.all())
 
 
 def _clip(actor: Any, box: Floats) -> None:
-    """Cut off what of an actor lies beyond the sides of a box."""
+    """Clip an actor at the vertical sides of a box."""
     for axis in (0, 1):
         for corner, inwards in zip(box, (1.0, -1.0), strict=True):
             normal = [0.0, 0.0, 0.0]
@@ -199,9 +214,9 @@ def _clip(actor: Any, box: Floats) -> None:
 
 
 def _projection(height: float) -> Floats:
-    """Along the lamp's light onto the plane z = height, m; a matrix (4, 4)."""
+    """The projection (4, 4) along the key light's direction onto the plane z = height, m."""
     matrix = np.eye(4)
-    matrix[:2, 2] = -TO_LAMP[:2] / TO_LAMP[2]
-    matrix[:2, 3] = height * TO_LAMP[:2] / TO_LAMP[2]
+    matrix[:2, 2] = -TO_KEY_LIGHT[:2] / TO_KEY_LIGHT[2]
+    matrix[:2, 3] = height * TO_KEY_LIGHT[:2] / TO_KEY_LIGHT[2]
     matrix[2, 2:] = 0.0, height
     return matrix

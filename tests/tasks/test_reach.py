@@ -1,4 +1,4 @@
-"""The reach task: observation, reward, goal, and the four variants."""
+"""The reach task: observation, reward, goal and the four variants."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.rotations import canonical, conjugate, multiply
 from gym_mara.state import SimState
-from gym_mara.tasks import PAPER_TASKS, TASKS, ReachTask, Task, make_task
+from gym_mara.tasks import PAPER_TASKS, TASKS, Goal, Observation, ReachTask, Task, named_task
 from gym_mara.testing import arms_of, arrays_of, uniform_q
+from gym_mara.types import Floats
 from tests.helpers import (
     TARGET_Q,
     TASK_NAMES,
-    Floats,
     golden,
     golden_q,
     joint_xml,
@@ -35,7 +36,7 @@ TARGET_QUATERNION = (0.0, 0.7071068, 0.7071068, 0.0)
 
 
 def _state(robot: RobotModel, q: Floats, seed: int | None = None) -> SimState:
-    """The state at q; with a seed the arms move, and some have collided."""
+    """The state at q (N, J), rad; with a seed, the arms move and some have collided."""
     count = len(q)
     position, quaternion = robot.kinematics().pose(q)
     qd, velocity, collided = np.zeros_like(q), np.zeros((count, 3)), np.zeros(count, np.bool_)
@@ -51,7 +52,15 @@ def _row(state: SimState, row: int) -> SimState:
     return arms_of(state, slice(row, row + 1))
 
 
-def test_the_four_tasks_are_four_values_of_one_class() -> None:
+def _goal(task: Task, robot: RobotModel, count: int) -> Goal:
+    return task.goal(robot, RobotWorkspace(robot), count)
+
+
+def _observe(task: Task, robot: RobotModel, state: SimState, goal: Goal) -> Floats:
+    return Observation(task.observation(robot, goal, robot.velocity_limit))(state, goal)
+
+
+def test_the_four_tasks_are_values_of_one_class() -> None:
     assert PAPER_TASKS == TASK_NAMES
     four = [TASKS[name] for name in PAPER_TASKS]
     uses = {
@@ -66,8 +75,8 @@ def test_the_four_tasks_are_four_values_of_one_class() -> None:
         "MARACollisionOrient-v0": (True, True),
     }
     for task in four:
-        plain, _ = make_task(task, {"orientation": False, "collision_penalty": False})
-        assert plain == TASKS["MARA-v0"], "all else is equal"
+        plain = dataclasses.replace(task, orientation=False, collision_penalty=False)  # type: ignore[call-arg]
+        assert plain == TASKS["MARA-v0"], "the tasks differ only in these two values"
 
 
 def test_the_constants_are_the_published_ones() -> None:
@@ -76,26 +85,28 @@ def test_the_constants_are_the_published_ones() -> None:
     assert constants == (5.0, 1.5, 1.0, 3.0, 0.03, 0.02)
 
 
-def test_golden_kinematics_have_the_golden_distances_angles_and_rewards(mara: RobotModel) -> None:
+def test_golden_configurations_have_the_golden_distances_angles_and_rewards(
+    mara: RobotModel,
+) -> None:
     rows = golden("kinematics_golden.csv")
     state = _state(mara, golden_q())
     for name, orientation in (("reward_MARA", False), ("reward_MARAOrient", True)):
         task = ReachTask(orientation=orientation)
-        goal = task.goal(mara, len(golden_q()))
+        goal = _goal(task, mara, len(golden_q()))
         reward, terms = task.reward(state, goal)
         np.testing.assert_allclose(terms["distance"], rows["rmse_m"], rtol=0.0, atol=1e-8)
         np.testing.assert_allclose(terms["angle_error"], rows["angle_rad"], rtol=0.0, atol=1e-7)
-        # Near the target the reward falls by 2,500 a metre.
+        # Near the target the slope of the reward is 2,500 per metre.
         np.testing.assert_allclose(reward, rows[name], rtol=0.0, atol=2e-5)
         far = rows["rmse_m"] > 0.01
         np.testing.assert_allclose(reward[far], rows[name][far], rtol=0.0, atol=1e-7)
 
 
-def test_golden_rewards_come_from_states_at_those_distances(mara: RobotModel) -> None:
+def test_states_at_the_golden_distances_have_the_golden_rewards(mara: RobotModel) -> None:
     rows = golden("reward_golden.csv")
     count = len(rows["reward"])
     task = ReachTask(orientation=True, collision_penalty=True)
-    goal = task.goal(mara, count)
+    goal = _goal(task, mara, count)
     half = rows["angle_rad"] / 2.0
     about_z = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     state = dataclasses.replace(
@@ -112,25 +123,25 @@ def test_golden_rewards_come_from_states_at_those_distances(mara: RobotModel) ->
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_the_reward_is_made_of_its_terms(mara: RobotModel, name: str) -> None:
+def test_the_terms_add_up_to_the_reward(mara: RobotModel, name: str) -> None:
     task = TASKS[name]
     state = _state(mara, uniform_q(mara, 40, 0), seed=0)
-    reward, terms = task.reward(state, task.goal(mara, 40))
-    whole = terms["reward_distance"] * terms["reward_orientation"] - 1 - terms["reward_collision"]
-    np.testing.assert_allclose(reward, whole, rtol=0.0, atol=1e-12)
+    reward, terms = task.reward(state, _goal(task, mara, 40))
+    total = terms["reward_distance"] * terms["reward_orientation"] - 1 - terms["reward_collision"]
+    np.testing.assert_allclose(reward, total, rtol=0.0, atol=1e-12)
     assert (terms["reward_orientation"] < 1.0).all() == ("Orient" in name)
-    punished = terms["reward_collision"] > 0.0
-    np.testing.assert_array_equal(punished, state.collided & ("Collision" in name))
+    penalised = terms["reward_collision"] > 0.0
+    np.testing.assert_array_equal(penalised, state.collided & ("Collision" in name))
 
 
 @pytest.mark.parametrize("orientation", [False, True])
-def test_the_observation_is_q_position_error_orientation_error_and_velocity(
+def test_the_observation_holds_q_position_error_orientation_error_and_velocity(
     mara: RobotModel, orientation: bool
 ) -> None:
     task = ReachTask(orientation=orientation)
-    goal = task.goal(mara, 40)
+    goal = _goal(task, mara, 40)
     state = _state(mara, uniform_q(mara, 40, 1), seed=1)
-    observation = task.observe(state, goal)
+    observation = _observe(task, mara, state, goal)
     assert observation.shape == (40, 16 if orientation else 12)
     np.testing.assert_array_equal(observation[:, :6], state.q)
     np.testing.assert_allclose(
@@ -151,36 +162,40 @@ def test_the_observation_is_q_position_error_orientation_error_and_velocity(
         )
 
 
-def test_the_orientation_error_turns_the_target_into_the_tool_and_has_no_sign_to_flip(
+def test_the_orientation_error_rotates_the_target_to_the_tool_and_ignores_the_sign_of_q(
     mara: RobotModel,
 ) -> None:
     task = ReachTask(orientation=True)
-    goal = task.goal(mara, 40)
+    goal = _goal(task, mara, 40)
     state = _state(mara, uniform_q(mara, 40, 2))
     flipped = dataclasses.replace(state, ee_quaternion=-state.ee_quaternion)
-    error = task.observe(state, goal)[:, 9:13]
-    np.testing.assert_allclose(task.observe(flipped, goal)[:, 9:13], error, rtol=0.0, atol=1e-12)
+    error = _observe(task, mara, state, goal)[:, 9:13]
+    np.testing.assert_allclose(
+        _observe(task, mara, flipped, goal)[:, 9:13], error, rtol=0.0, atol=1e-12
+    )
     turned = canonical(multiply(error, goal.quaternion))
     np.testing.assert_allclose(turned, canonical(state.ee_quaternion), rtol=0.0, atol=1e-12)
 
 
-def test_at_the_target_the_errors_vanish(mara: RobotModel) -> None:
+def test_at_the_target_the_errors_are_zero(mara: RobotModel) -> None:
     task = ReachTask(orientation=True)
-    observation = task.observe(_state(mara, np.array([TARGET_Q])), task.goal(mara, 1))[0]
+    observation = _observe(task, mara, _state(mara, np.array([TARGET_Q])), _goal(task, mara, 1))[0]
     np.testing.assert_allclose(observation[6:9], 0.0, atol=2e-5)
     np.testing.assert_allclose(observation[9:13], [1.0, 0.0, 0.0, 0.0], atol=1e-5)
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_a_batch_is_its_rows(mara: RobotModel, name: str) -> None:
+def test_a_batch_gives_the_same_results_as_single_rows(mara: RobotModel, name: str) -> None:
     task = TASKS[name]
     state = _state(mara, uniform_q(mara, 40, 3), seed=3)
-    observation = task.observe(state, task.goal(mara, 40))
-    reward, terms = task.reward(state, task.goal(mara, 40))
-    goal = task.goal(mara, 1)
+    observation = _observe(task, mara, state, _goal(task, mara, 40))
+    reward, terms = task.reward(state, _goal(task, mara, 40))
+    goal = _goal(task, mara, 1)
     for row in range(40):
         one, alone = slice(row, row + 1), _row(state, row)
-        np.testing.assert_allclose(observation[one], task.observe(alone, goal), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            observation[one], _observe(task, mara, alone, goal), rtol=0, atol=1e-12
+        )
         single_reward, single_terms = task.reward(alone, goal)
         np.testing.assert_allclose(reward[one], single_reward, rtol=0.0, atol=1e-12)
         assert single_terms.keys() == terms.keys()
@@ -189,104 +204,99 @@ def test_a_batch_is_its_rows(mara: RobotModel, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_the_state_and_the_goal_stay_as_they_are(mara: RobotModel, name: str) -> None:
+def test_overwriting_the_results_leaves_the_state_and_the_goal_unchanged(
+    mara: RobotModel, name: str
+) -> None:
     task = TASKS[name]
-    state, goal = _state(mara, uniform_q(mara, 3, 4), seed=4), task.goal(mara, 3)
-    given = [*arrays_of(state).values(), goal.position, goal.quaternion]
-    kept = copy.deepcopy(given)
-    observation = task.observe(state, goal)
+    state, goal = _state(mara, uniform_q(mara, 3, 4), seed=4), _goal(task, mara, 3)
+    inputs = [*arrays_of(state).values(), goal.position, goal.quaternion]
+    originals = copy.deepcopy(inputs)
+    observation = _observe(task, mara, state, goal)
     reward, terms = task.reward(state, goal)
-    for mine in (observation, reward, *terms.values()):
-        mine[...] = -7.0
-    for array, before in zip(given, kept, strict=True):
-        np.testing.assert_array_equal(array, before)
+    for result in (observation, reward, *terms.values()):
+        result[...] = -7.0
+    for array, original in zip(inputs, originals, strict=True):
+        np.testing.assert_array_equal(array, original)
 
 
-def test_no_state_ends_the_episode(mara: RobotModel) -> None:
+def test_the_task_terminates_no_episode(mara: RobotModel) -> None:
     task = ReachTask()
     state = _state(mara, uniform_q(mara, 40, 5), seed=5)
-    assert not task.terminated(state, task.goal(mara, 40)).any()
+    assert not task.terminated(state, _goal(task, mara, 40)).any()
 
 
-def test_maras_target_is_the_published_one(mara: RobotModel) -> None:
-    goal = ReachTask().goal(mara, 3)
+def test_maras_default_target_is_the_published_one(mara: RobotModel) -> None:
+    goal = _goal(ReachTask(), mara, 3)
     np.testing.assert_array_equal(goal.position, np.tile(TARGET_POSITION, (3, 1)))
     np.testing.assert_allclose(goal.quaternion, np.tile(TARGET_QUATERNION, (3, 1)), atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(goal.quaternion, axis=1), 1.0, rtol=0, atol=1e-12)
 
 
-def test_a_target_can_be_given(mara: RobotModel) -> None:
+def test_the_user_can_give_a_target(mara: RobotModel) -> None:
     (position,), (quaternion,) = mara.kinematics().pose(uniform_q(mara, 1, 6))
     task = ReachTask(
         orientation=True, target_position=tuple(position), target_quaternion=tuple(-quaternion)
     )
-    goal = task.goal(mara, 2)
+    goal = _goal(task, mara, 2)
     np.testing.assert_allclose(goal.position, np.tile(position, (2, 1)), rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(goal.quaternion, np.tile(quaternion, (2, 1)), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_another_robot_has_a_target_of_its_own_that_it_reaches(name: str) -> None:
+def test_another_robot_has_its_own_target_and_can_reach_it(name: str) -> None:
     robot = robot_model(name)
-    goal, again = ReachTask().goal(robot, 1), ReachTask().goal(robot, 1)
-    np.testing.assert_array_equal(again.position, goal.position)
-    np.testing.assert_array_equal(again.quaternion, goal.quaternion)
+    goal, repeated = _goal(ReachTask(), robot, 1), _goal(ReachTask(), robot, 1)
+    np.testing.assert_array_equal(repeated.position, goal.position)
+    np.testing.assert_array_equal(repeated.quaternion, goal.quaternion)
     q = solve_ik(robot, goal.position[0], goal.quaternion[0])[None]
     np.testing.assert_allclose(robot.kinematics().pose(q)[0], goal.position, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
 @pytest.mark.parametrize("robot", ["mara", "ur5", "panda"])
-def test_every_state_lies_in_the_observation_space(name: str, robot: str) -> None:
+def test_every_observation_lies_in_the_observation_space(name: str, robot: str) -> None:
     arm, task = robot_model(robot), TASKS[name]
-    goal = task.goal(arm, 300)
-    space = task.observation_space(arm, goal, arm.velocity_limit)
+    goal = _goal(task, arm, 300)
+    space = Observation(task.observation(arm, goal, arm.velocity_limit)).space
     assert space.shape == (arm.num_joints + (10 if "Orient" in name else 6),)
     q = uniform_q(arm, 300, 7)
     qd = np.random.default_rng(8).choice([-1.0, 1.0], size=q.shape) * arm.velocity_limit
     state = dataclasses.replace(_state(arm, q), ee_velocity=arm.kinematics().velocity(q, qd))
-    for observation in task.observe(state, goal):
+    for observation in _observe(task, arm, state, goal):
         assert space.contains(observation)
 
 
-def test_a_target_out_of_reach_warns_by_how_many_millimetres(mara: RobotModel) -> None:
+def test_the_warning_for_a_target_out_of_reach_gives_the_distance(mara: RobotModel) -> None:
     task = ReachTask(target_position=(0.0, 0.0, 2.0))
-    # Stretched straight up the tool is 1.7917 m high.
+    # The tool is at a height of 1.7917 m when the arm points straight up.
     with pytest.warns(UserWarning, match=r"out of reach of mara's 'ee_link'.*208\.3 mm"):
-        task.goal(mara, 1)
+        _goal(task, mara, 1)
 
 
-def test_an_orientation_out_of_reach_warns_by_how_many_degrees(mara: RobotModel) -> None:
-    asked: dict[str, Any] = {
+def test_the_warning_for_an_orientation_out_of_reach_gives_the_angle(mara: RobotModel) -> None:
+    target: dict[str, Any] = {
         "target_position": (0.0, -0.001, 1.79),
         "target_quaternion": (0.0, 1.0, 0.0, 0.0),
     }
-    with pytest.warns(UserWarning, match=r"no nearer than [\d.]+ mm and [\d.]+°"):
-        ReachTask(orientation=True, **asked).goal(mara, 1)
-    # Where the orientation does not count, it cannot be out of reach; a warning would be an error here.
-    ReachTask(orientation=False, **asked).goal(mara, 1)
+    with pytest.warns(UserWarning, match=r"the closest pose is [\d.]+ mm and [\d.]+° away"):
+        _goal(ReachTask(orientation=True, **target), mara, 1)
+    # Without `orientation` only the position must be in reach: a warning would fail the test here.
+    _goal(ReachTask(orientation=False, **target), mara, 1)
 
 
-def test_an_arm_without_a_known_target_gets_one(tmp_path: Path) -> None:
+def test_a_custom_arm_gets_a_default_target_in_reach(tmp_path: Path) -> None:
     urdf = write(tmp_path / "stick.urdf", urdf_xml(*map(joint_xml, range(4))))
     robot = RobotModel.load(urdf, "link4")
-    goal = ReachTask().goal(robot, 1)
+    goal = _goal(ReachTask(), robot, 1)
     q = solve_ik(robot, goal.position[0], goal.quaternion[0])
     np.testing.assert_allclose(robot.kinematics().pose(q[None])[0], goal.position, atol=1e-3)
 
 
-def test_options_become_plain_values_that_go_through_json() -> None:
-    task, rest = make_task(
-        "MARA-v0",
-        {"target_position": np.array([0.1, 0.2, 0.9]), "start_q": [0] * 6, "collision": "fcl"},
-    )
-    assert rest == {"collision": "fcl"}
-    assert isinstance(task, ReachTask)
+def test_options_become_plain_values_that_json_can_store() -> None:
+    task = ReachTask(target_position=np.array([0.1, 0.2, 0.9]), start_q=[0] * 6)  # type: ignore[arg-type]
     assert task.target_position == (0.1, 0.2, 0.9)
     assert task.start_q == (0.0,) * 6
-    again, _ = make_task("MARA-v0", json.loads(json.dumps(dataclasses.asdict(task))))
-    assert again == task
-    assert TASKS["MARA-v0"] == ReachTask(), "the registered task is not touched"
+    assert ReachTask(**json.loads(json.dumps(dataclasses.asdict(task)))) == task
 
 
 @pytest.mark.parametrize(
@@ -309,17 +319,17 @@ def test_options_become_plain_values_that_go_through_json() -> None:
         ({"alpha": "steep"}, "alpha must be"),
     ],
 )
-def test_values_out_of_their_range_are_refused(options: dict[str, Any], message: str) -> None:
+def test_invalid_values_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(GymMaraError, match=message):
-        make_task("MARA-v0", options)
+        ReachTask(**options)
 
 
-def test_an_unknown_task_is_named_with_the_known_ones() -> None:
+def test_the_error_for_an_unknown_task_suggests_a_known_one() -> None:
     with pytest.raises(GymMaraError, match=r"unknown task 'MARO-v0'\. Did you mean 'MARA-v0'\?"):
-        make_task("MARO-v0", {})
+        named_task("MARO-v0")
 
 
-def test_a_task_cannot_be_changed() -> None:
+def test_a_task_is_immutable() -> None:
     task: Task = ReachTask()
     with pytest.raises(dataclasses.FrozenInstanceError):
         task.on_collision = "continue"  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""The reward's functions: golden values, bounds, monotony, batches."""
+"""The reward functions: golden values, bounds, monotonicity, batches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gym_mara.tasks import rewards
-from tests.helpers import Floats, Mask, golden
+from gym_mara.types import Floats, Mask
+from tests.helpers import golden
 
 ALPHA, BETA, GAMMA, DELTA, ETA, KAPPA = 5.0, 1.5, 1.0, 3.0, 0.03, 0.02
 
@@ -19,7 +20,7 @@ flags = arrays(np.bool_, 12)
 
 
 def _reward(distance: Floats, angle: Floats, collided: Mask) -> Floats:
-    """The whole reward of MARACollisionOrient-v0, from its parts."""
+    """The total reward of MARACollisionOrient-v0, from the functions under test."""
     return (
         rewards.distance_reward(distance, ALPHA, KAPPA)
         * rewards.orientation_factor(angle, BETA, GAMMA)
@@ -29,7 +30,7 @@ def _reward(distance: Floats, angle: Floats, collided: Mask) -> Floats:
 
 
 def _formula(distance: Floats, angle: Floats, collided: Mask) -> Floats:
-    """The published formula, letter by letter."""
+    """The same reward, written like the published formula."""
     wide = (np.exp(-ALPHA * distance) - np.exp(-ALPHA)) / (1 - np.exp(-ALPHA))
     peak = (np.exp(-ALPHA * distance / KAPPA) - np.exp(-ALPHA / KAPPA)) / (
         1 - np.exp(-ALPHA / KAPPA)
@@ -46,7 +47,7 @@ def test_golden_rewards() -> None:
 
 
 @given(distances, angles, flags)
-def test_the_reward_is_the_published_formula(
+def test_the_reward_equals_the_published_formula(
     distance: Floats, angle: Floats, collided: Mask
 ) -> None:
     np.testing.assert_allclose(
@@ -67,13 +68,13 @@ def test_the_best_reward_is_10_and_the_worst_is_bounded(
     assert (reward >= floor - 1e-12).all()
 
 
-def test_ten_a_step_at_the_target_in_its_orientation() -> None:
+def test_the_reward_at_the_target_pose_is_10() -> None:
     at_target = _reward(np.zeros(1), np.zeros(1), np.array([False]))
     assert at_target == pytest.approx(10.0, abs=1e-12)
 
 
 @given(distances, st.floats(0.5, 20.0), st.floats(0.01, 1.0))
-def test_nearer_is_better_whatever_the_constants(
+def test_the_distance_reward_never_falls_with_a_smaller_distance(
     distance: Floats, alpha: float, kappa: float
 ) -> None:
     reward = rewards.distance_reward(np.sort(distance), alpha, kappa)
@@ -82,13 +83,13 @@ def test_nearer_is_better_whatever_the_constants(
     assert rewards.distance_reward(np.ones(1), alpha, kappa) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_millimetre_nearer_is_strictly_better() -> None:
+def test_the_distance_reward_rises_with_every_millimetre() -> None:
     distance = np.arange(0.0, 1.0, 1e-3)
     assert (np.diff(rewards.distance_reward(distance, ALPHA, KAPPA)) < 0.0).all()
 
 
 @given(angles, st.floats(0.1, 5.0), st.floats(0.0, 5.0))
-def test_better_aligned_is_better_whatever_the_constants(
+def test_the_orientation_factor_never_falls_with_a_smaller_angle(
     angle: Floats, beta: float, gamma: float
 ) -> None:
     factor = rewards.orientation_factor(np.sort(angle), beta, gamma)
@@ -99,7 +100,7 @@ def test_better_aligned_is_better_whatever_the_constants(
 
 
 @given(distances, flags)
-def test_a_collision_costs_more_the_further_off_and_at_most_delta(
+def test_the_collision_penalty_grows_with_the_distance_up_to_delta(
     distance: Floats, collided: Mask
 ) -> None:
     penalty = rewards.collision_penalty(collided, np.sort(distance), DELTA, ETA)
@@ -110,7 +111,9 @@ def test_a_collision_costs_more_the_further_off_and_at_most_delta(
 
 
 @given(distances, angles, flags)
-def test_a_batch_is_its_rows(distance: Floats, angle: Floats, collided: Mask) -> None:
+def test_a_batch_gives_the_same_results_as_single_rows(
+    distance: Floats, angle: Floats, collided: Mask
+) -> None:
     together = _reward(distance, angle, collided)
     for row in range(len(distance)):
         one = slice(row, row + 1)

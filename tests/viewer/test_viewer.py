@@ -1,4 +1,4 @@
-"""The viewer, in a real browser: what its user does there is done with the arm."""
+"""The viewer in a real browser: the user's actions there reach the simulation."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from gym_mara.envs import MaraEnv
+from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError
-from gym_mara.rendering.look import VIEW_ANGLE
+from gym_mara.rendering.camera import VIEW_ANGLE
 from gym_mara.testing import COLLIDING_Q, pickled
 from tests.browser import chromium
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of viser's server
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # from viser's server
 ACTION = np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], np.float32)
 
 
-def until(true: Callable[[], bool], what: str, seconds: float = 30.0) -> None:
-    """Wait until something is true."""
+def wait_until(condition: Callable[[], bool], description: str, seconds: float = 30.0) -> None:
+    """Wait until a condition is true, or fail."""
     deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
+    while not condition():
+        assert time.monotonic() < deadline, f"not true within {seconds:g} s: {description}"
         time.sleep(0.02)
 
 
 class Loop(threading.Thread):
-    """A program that steps an environment with a viewer, as a user's does."""
+    """Steps an environment with a viewer in a thread, as a user's program would."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(daemon=True)
@@ -55,7 +56,7 @@ class Loop(threading.Thread):
         return self.observation[:6]
 
     def stop(self) -> None:
-        """Stop stepping, paused or not, and close the environment."""
+        """Stop the thread, even if it is paused, and close the environment."""
         self._stopped.set()
         self.viewer.set_playing(True)
         self.join(timeout=20)
@@ -92,37 +93,37 @@ def test_pause_step_and_play(page: Page, loop: Loop) -> None:
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Play").wait_for()
     time.sleep(0.3)
-    held = loop.steps
+    paused_at = loop.steps
     time.sleep(0.5)
-    assert loop.steps == held
+    assert loop.steps == paused_at
     for count in (1, 2):
         page.get_by_role("button", name="Step").click()
-        until(lambda count=count: loop.steps >= held + count, "a step")  # type: ignore[misc]
+        wait_until(lambda count=count: loop.steps >= paused_at + count, "the viewer takes one step")  # type: ignore[misc]
         time.sleep(0.3)
-        assert loop.steps == held + count
+        assert loop.steps == paused_at + count
     page.get_by_role("button", name="Play").click()
-    until(lambda: loop.steps > held + 10, "ten steps more")
+    wait_until(lambda: loop.steps > paused_at + 10, "the viewer takes ten more steps")
 
 
-def test_a_slider_that_is_moved_leads_the_joint_until_it_is_let_go(page: Page, loop: Loop) -> None:
-    until(lambda: abs(loop.q[0] - 0.3) < 1e-3, "the arm is where the action sends it")
-    page.get_by_role("slider").nth(2).focus()  # the first is the speed's
+def test_the_user_jogs_a_joint_with_its_slider(page: Page, loop: Loop) -> None:
+    wait_until(lambda: abs(loop.q[0] - 0.3) < 1e-3, "the arm reaches the action's targets")
+    page.get_by_role("slider").nth(2).focus()  # the first slider is the speed
     page.keyboard.press("End")
-    until(lambda: loop.q[1] > 1.5, "motor2 goes to its upper limit")
-    until(page.get_by_label("By hand").is_checked, "the page shows that a hand leads")
-    page.get_by_label("By hand").uncheck()
-    until(lambda: abs(loop.q[1]) < 1e-3, "the action leads again")
+    wait_until(lambda: loop.q[1] > 1.5, "motor2 moves to its upper limit")
+    wait_until(page.get_by_label("Jog").is_checked, "the page shows that the user jogs")
+    page.get_by_label("Jog").uncheck()
+    wait_until(lambda: abs(loop.q[1]) < 1e-3, "the arm follows the action again")
 
 
-def test_the_speed_is_that_of_the_slider(page: Page, loop: Loop) -> None:
+def test_the_slider_sets_the_speed(page: Page, loop: Loop) -> None:
     def rate() -> float:
         begin, steps = time.monotonic(), loop.steps
         time.sleep(1.0)
         return (loop.steps - steps) / (time.monotonic() - begin)
 
-    assert rate() < 55.0, "real time, 50 steps a second"
+    assert rate() < 55.0, "real time is 50 steps per second"
     page.get_by_role("slider").first.focus()
-    page.keyboard.press("Home")  # a tenth
+    page.keyboard.press("Home")  # 0.1 of real time
     time.sleep(0.5)
     assert rate() < 8.0
 
@@ -130,57 +131,58 @@ def test_the_speed_is_that_of_the_slider(page: Page, loop: Loop) -> None:
 def test_the_backend_can_be_switched(page: Page, loop: Loop) -> None:
     page.get_by_role("combobox").last.click()
     page.get_by_role("option", name="dart").click()
-    until(lambda: "joint_torque" in loop.info, "DART reports torques")
+    wait_until(lambda: "joint_torque" in loop.info, "DART reports torques")
     assert loop.env.simulation.backend_name == "dart"
-    until(lambda: abs(loop.q[0] - 0.3) < 0.05, "and moves the arm")
+    wait_until(lambda: abs(loop.q[0] - 0.3) < 0.05, "DART moves the arm to the action's targets")
 
 
-def test_the_target_is_dragged(page: Page, loop: Loop) -> None:
+def test_the_user_drags_the_target(page: Page, loop: Loop) -> None:
     simulation = loop.env.simulation
     goal, error = simulation.goal.position[0].copy(), loop.observation[6:9].copy()
     axis = pinocchio.Quaternion(*simulation.goal.quaternion[0]).matrix()[:, 0]
-    grip, end = goal + 0.17 * axis, goal + 0.27 * axis  # the head of the handle's arrow along x
+    grip, end = goal + 0.17 * axis, goal + 0.27 * axis  # the arrow head of the handle's x axis
 
     def pixel(point: Any) -> tuple[float, float]:
         camera = loop.viewer.camera
         forwards = (camera.at - camera.eye) / np.linalg.norm(camera.at - camera.eye)
         right = np.cross(forwards, camera.up)
         right /= np.linalg.norm(right)
-        away = point - camera.eye
-        scale = 350.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (away @ forwards)
-        return 450.0 + scale * (away @ right), 350.0 - scale * (away @ np.cross(right, forwards))
+        ray = point - camera.eye
+        scale = 350.0 / np.tan(np.radians(VIEW_ANGLE / 2.0)) / (ray @ forwards)
+        return 450.0 + scale * (ray @ right), 350.0 - scale * (ray @ np.cross(right, forwards))
 
-    time.sleep(2.0)  # the scene is drawn in software here
+    time.sleep(2.0)  # this browser draws the scene in software, which is slow
     page.mouse.move(*pixel(grip))
     time.sleep(0.5)
     page.mouse.down()
-    for share in np.linspace(0.0, 1.0, 8):
-        page.mouse.move(*pixel((1.0 - share) * grip + share * end))
+    for fraction in np.linspace(0.0, 1.0, 8):
+        page.mouse.move(*pixel((1.0 - fraction) * grip + fraction * end))
         time.sleep(0.1)
     page.mouse.up()
-    until(lambda: bool((simulation.goal.position[0] != goal).any()), "the goal moves")
+    wait_until(lambda: bool((simulation.goal.position[0] != goal).any()), "the goal moves")
     time.sleep(0.5)
     moved = simulation.goal.position[0] - goal
     assert 0.05 < moved @ axis < 0.15
     np.testing.assert_allclose(moved, (moved @ axis) * axis, atol=1e-3)
-    until(
-        lambda: bool(np.allclose(loop.observation[6:9], error - moved, atol=0.01)), "it is observed"
+    wait_until(
+        lambda: bool(np.allclose(loop.observation[6:9], error - moved, atol=0.01)),
+        "the observation shows the new goal",
     )
 
 
-def test_reward_and_distance_are_plotted(page: Page, loop: Loop) -> None:
+def test_the_panel_plots_reward_and_distance(page: Page, loop: Loop) -> None:
     page.locator(".uplot").first.wait_for()
     assert page.locator(".uplot").count() == 2
     for label in ("Reward", "Position error, mm"):
         assert page.get_by_text(label, exact=True).is_visible()
 
 
-def test_the_page_is_told_when_the_environment_closes(browser: Browser) -> None:
+def test_the_page_shows_when_the_environment_closes(browser: Browser) -> None:
     loop = Loop()
     loop.start()
     page = browser.new_page()
     page.goto(loop.viewer.url)
-    page.get_by_role("button", name="Pause").click()  # a paused program is not held for ever either
+    page.get_by_role("button", name="Pause").click()  # closing must work while paused
     loop.stop()
     page.get_by_text("The environment was closed").wait_for()
     page.close()
@@ -188,33 +190,35 @@ def test_the_page_is_told_when_the_environment_closes(browser: Browser) -> None:
         socket.create_connection(("127.0.0.1", int(loop.viewer.url.rsplit(":", 1)[1])))
 
 
-def test_nobody_at_the_browser_holds_nothing_up() -> None:
+def test_a_pause_has_no_effect_without_a_browser() -> None:
     loop = Loop()
     loop.viewer.set_playing(False)
     loop.start()
-    until(lambda: loop.steps > 3, "steps without a browser")
+    wait_until(lambda: loop.steps > 3, "the arm steps without a browser")
     loop.stop()
 
 
-def test_a_port_in_use_is_passed_over(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_viewer_uses_the_next_port_if_its_port_is_in_use(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     first, second = Loop(viewer_port=8200), Loop(viewer_port=8200)
     ports = [int(loop.viewer.url.rsplit(":", 1)[1]) for loop in (first, second)]
     assert ports[1] == ports[0] + 1
-    assert f"port 8200 is in use; the viewer takes {ports[1]}" in capsys.readouterr().out
+    assert f"port 8200 is in use; the viewer uses port {ports[1]}" in capsys.readouterr().out
     for loop in (first, second):
         loop.env.close()
 
 
-def test_it_listens_on_this_machine_alone() -> None:
+def test_the_viewer_listens_on_localhost_only() -> None:
     loop = Loop()
     host, port = loop.viewer.url.removeprefix("http://").split(":")
     assert host == "127.0.0.1"
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as other:
-        other.bind(("127.0.0.2", int(port)))  # which would be in use, were it listening everywhere
+        other.bind(("127.0.0.2", int(port)))  # fails if the viewer listens on all addresses
     loop.env.close()
 
 
-def test_an_address_that_is_not_ours_is_refused() -> None:
+def test_an_address_of_another_machine_is_refused() -> None:
     env = MaraEnv(render_mode="human", viewer_host="192.0.2.1")
     with pytest.raises(GymMaraError, match="viewer_host"):
         env.reset()
@@ -230,25 +234,25 @@ def test_a_copy_has_no_viewer_until_it_is_reset() -> None:
     loop.env.close()
 
 
-def test_what_collides_is_shown() -> None:
+def test_the_view_marks_colliding_links() -> None:
     loop = Loop(max_joint_velocity=None)
     loop.env.step(np.array(COLLIDING_Q, np.float32))
-    assert loop.env.simulation.view(0).touching
+    assert view_of(loop.env.simulation, 0).touching
     assert loop.env.render() is None
     loop.env.close()
 
 
-@pytest.mark.parametrize("what", ["_plot", "_stage.show"])
-def test_a_sender_that_could_not_be_woken_does_not_stop_the_arm(
-    monkeypatch: pytest.MonkeyPatch, what: str
+@pytest.mark.parametrize("failing", ["_panel.update", "_scene.show"])
+def test_a_race_in_visers_sender_does_not_stop_the_arm(
+    monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
-    def fails(*_: Any) -> None:
+    def fails(*_: Any, **__: Any) -> None:
         raise RuntimeError(reason)
 
     loop = Loop()
-    owner = loop.viewer._stage if "." in what else loop.viewer
-    monkeypatch.setattr(owner, what.split(".")[-1], fails)
-    loop.viewer._drawn = loop.viewer._plotted = 0.0  # both are due
+    owner, method = failing.split(".")
+    monkeypatch.setattr(getattr(loop.viewer, owner), method, fails)
+    loop.viewer._drawn = loop.viewer._plotted = 0.0  # the scene and the plots are due
     reason = "deque mutated during iteration"
     loop.env.step(ACTION)
     loop.viewer._drawn = loop.viewer._plotted = 0.0

@@ -1,4 +1,4 @@
-"""What a grid of runs has come to, as figures and as a table."""
+"""The results of a grid, as figures and as tables."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from gym_mara.agents.experiments.grid import Grid, read_grid, read_result
-from gym_mara.agents.runs.evaluation import MAX_EPISODE_STEPS
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
 
-# Metric → where a result has it, and its digits.
+# Column of the table → where a result holds its value, and how many digits are printed.
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
     "position error, mm": (("last", "position_error_mm"), 4),
     "angle, deg": (("last", "angle_deg"), 2),
@@ -48,7 +47,7 @@ class Interval:
 def interquartile_mean(values: Sequence[float]) -> Interval:
     """The mean of the middle half of the values (of all, where there are fewer than four), with its interval.
 
-    Infinity, for what has not come about, is kept: where it is among what is averaged, the mean is infinite.
+    An infinite value stands for something that a run never reached. If it is among the averaged values, the mean is infinite.
     """
     data = np.asarray(values, np.float64)
     centre = float(trim_mean(data, 0.25))
@@ -64,13 +63,13 @@ def interquartile_mean(values: Sequence[float]) -> Interval:
 
 
 def plot_grid(folder: Path) -> list[Path]:
-    """Draw the figures of a grid and write its table and curves into its folder; returns the files.
+    """Draw the figures of a grid into its folder, with its table and curves; returns the files.
 
-    A figure for each environment, one for each environment of ACKTR alone, `table.md`, `table.csv` and `curves.csv`. What
-    has not finished is left out.
+    For each environment there is a figure of all algorithms, ENV.png, and one of each algorithm alone, ENV_ALGO.png. The
+    tables are `table.md`, `table.csv` and `curves.csv`. Runs that have not finished are left out.
 
     Raises:
-        GymMaraError: the folder is no grid, or no run in it has finished.
+        GymMaraError: the folder holds no grid, or none of its runs has finished.
     """
     grid = read_grid(folder)
     results = {
@@ -81,11 +80,12 @@ def plot_grid(folder: Path) -> list[Path]:
     curves = {name: _curve(folder / name) for name in results}
     files = []
     for env in grid.envs:
-        finished = {grid.runs()[name].algo for name in results if grid.runs()[name].env == env}
+        runs = [grid.runs()[name] for name in results]
+        finished = [a for a in grid.algos if any((r.env, r.algo) == (env, a) for r in runs)]
         if finished:
             files.append(_draw(folder / f"{env}.png", grid, env, grid.algos, curves))
-        if "acktr" in finished:
-            files.append(_draw(folder / f"{env}_acktr.png", grid, env, ("acktr",), curves))
+        for algo in finished:
+            files.append(_draw(folder / f"{env}_{algo}.png", grid, env, [algo], curves))
     files.append(_write_curves(folder / "curves.csv", grid, curves))
     rows = list(_rows(grid, results))
     files.append(_write_table(folder / "table.csv", rows))
@@ -97,17 +97,17 @@ def _curve(path: Path) -> list[dict[str, float]]:
     """A finished run's table of progress.
 
     Raises:
-        DamagedRunError: it is gone or damaged, and how to have it trained again.
+        DamagedRunError: it is missing or damaged; the message says how to train the run again.
     """
     try:
         rows = read_progress(path / "progress.csv")
         if any(_TRAINING in row for row in rows):
             return rows
-        raise DamagedRunError("it holds no curve")
+        raise DamagedRunError("it holds no training rewards")
     except (OSError, DamagedRunError) as error:
         raise DamagedRunError(
             f"the finished run {str(path)!r} is damaged: progress.csv: {error}; "
-            "move the folder away and give the benchmark's command again to train it anew"
+            "move the folder away and run the same benchmark command to train it again"
         ) from error
 
 
@@ -118,7 +118,7 @@ def _draw(
     algos: Sequence[str],
     curves: dict[str, list[dict[str, float]]],
 ) -> Path:
-    """Mean episode reward against steps: a colour an algorithm; where it is alone, a line a seed too."""
+    """Mean episode reward against steps, a colour for each algorithm; one that is alone also has a line for each seed."""
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axis = figure.subplots()
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
@@ -160,7 +160,7 @@ def _draw_band(
 def _episode_reward(
     rows: list[dict[str, float]], steps: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The reward of a whole episode, 2048 steps, at the mean reward per step since the last of these numbers of steps."""
+    """The reward of a whole episode at these numbers of steps, from the mean reward per step since the number before."""
     points = [(r["time/total_timesteps"], r[_TRAINING]) for r in rows if _TRAINING in r]
     x, y = (np.array(column) for column in zip(*points, strict=True))
     part = np.searchsorted(steps, x).clip(max=len(steps) - 1)
@@ -172,7 +172,7 @@ def _episode_reward(
 
 
 def _write_curves(file: Path, grid: Grid, curves: dict[str, list[dict[str, float]]]) -> Path:
-    """Every curve at the same steps, with what the evaluations in between saw."""
+    """Write all curves, sampled at the same steps, and the results of the evaluations during training."""
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
     evaluated = (_EVALUATION, "eval/position_error_mm", "eval/angle_deg")
     with file.open("w", newline="") as stream:
@@ -209,7 +209,7 @@ def _rows(grid: Grid, results: dict[str, dict[str, Any]]) -> Iterator[dict[str, 
             for title, (path, digits) in COLUMNS.items():
                 values = [_value(run, path) for run in runs]
                 if "angle" in title and not getattr(TASKS[env], "orientation", False):
-                    values = [math.inf]  # nobody asked for it
+                    values = [math.inf]  # the task does not judge the angle
                 row[title] = interquartile_mean(values), digits
             yield row
 
@@ -243,7 +243,7 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def format_interval(interval: Interval, digits: int) -> str:
-    """An interval as a cell of a table; a dash for what has not come about."""
+    """An interval as a cell of a table; a dash if the mean is infinite."""
     if not np.isfinite(interval.mean):
         return "-"
     if interval.mean >= 1.0:

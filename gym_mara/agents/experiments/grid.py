@@ -13,7 +13,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from gym_mara.agents.algorithms.presets import PRESETS
+from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.local import Engine, Say
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import (
@@ -24,10 +24,9 @@ from gym_mara.agents.runs.folder import (
     read_progress,
     write_atomically,
 )
-from gym_mara.agents.runs.policy import algorithm_class
 from gym_mara.agents.training.callbacks import Report
 from gym_mara.agents.training.train import resume, train
-from gym_mara.backends import backend_names
+from gym_mara.backends import DEFAULT_BACKEND, backend_names
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks import TASKS
 
@@ -47,8 +46,8 @@ class Grid:
     seeds: int
     """Runs of each pair, with the seeds 0, 1, …"""
     steps: int
-    preset_name: str = "tuned"
-    backend: str = "pinocchio"
+    preset_name: str = DEFAULT_PRESET
+    backend: str = DEFAULT_BACKEND
     checkpoint_every: int = 50_000
 
     def check(self) -> None:
@@ -57,11 +56,9 @@ class Grid:
             if env not in TASKS:
                 raise unknown("environment", env, TASKS)
         for algo in self.algos:
-            algorithm_class(algo)
+            algorithm(algo).preset_pair(self.preset_name)
         if self.backend not in backend_names():
             raise unknown("backend", self.backend, backend_names())
-        if self.preset_name not in PRESETS:
-            raise unknown("preset", self.preset_name, PRESETS)
         for names in (self.envs, self.algos):
             if len(set(names)) < len(names):
                 raise GymMaraError(f"{', '.join(names)}: name each once")
@@ -133,8 +130,8 @@ def read_grid(folder: Path) -> Grid:
 
 def _presets(grid: Grid) -> Any:
     """A grid's presets as they are now, in the form in which a file has them."""
-    presets = {algo: [asdict(p) for p in PRESETS[grid.preset_name][algo]] for algo in grid.algos}
-    return json.loads(json.dumps(presets))
+    pairs = {algo: algorithm(algo).preset_pair(grid.preset_name) for algo in grid.algos}
+    return json.loads(json.dumps({algo: list(map(asdict, pair)) for algo, pair in pairs.items()}))
 
 
 def _read(folder: Path) -> tuple[Grid, Any]:

@@ -16,51 +16,21 @@ from filelock import FileLock, Timeout
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from gym_mara.agents.algorithms import presets
+from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, is_schedule
+from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.experiments.local import Say, run_tasks
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
-from gym_mara.agents.training.train import train
-from gym_mara.errors import GymMaraError, TrainingDivergedError, unknown
+from gym_mara.agents.training.train import preset_of, train
+from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
 """Trials train on seeds from here on; results are reported of seeds from 0 on."""
 
-# Algorithm → hyperparameter → (lowest, highest), on a logarithmic scale, or a list of what it can be.
-SPACES: dict[str, dict[str, tuple[float, float] | list[Any]]] = {
-    "ppo": {
-        "n_steps": [1, 2, 4, 8],
-        "batch_size": [256, 512],
-        "n_epochs": [1, 2, 4],
-        "learning_rate": (1e-2, 2e-1),
-        "covariance_rate": (0.5, 3.0),
-        "widening": (0.02, 0.2),
-    },
-    "trpo": {
-        "n_steps": [1, 2, 4, 8],
-        "target_kl": (2e-2, 2e-1),
-        "cg_damping": (1.0, 100.0),
-        "covariance_rate": (0.3, 3.0),
-        "bias_rate": [1.0, 3.0, 10.0, 30.0],
-        "widening": (0.02, 0.2),
-    },
-    "acktr": {
-        "n_steps": [1, 2, 4, 8],
-        "learning_rate": (1e-2, 1.0),
-        "target_kl": (3e-4, 3e-2),
-        "critic_kl": (3e-2, 1.0),
-        "damping": (1e-3, 1e-1),
-        "fisher_decay": [0.9, 0.95, 0.99],
-        "momentum": [0.0, 0.5, 0.9],
-        "log_std_init": [-2.0, -1.5, -1.0],
-    },
-}
-
-
 _EVALUATIONS = 10
 """How often a run is evaluated, and may be given up."""
-_OF_POLICY = ("log_std_init", "covariance_rate", "bias_rate", "widening")
 
 
 @dataclass(frozen=True)
@@ -74,6 +44,13 @@ class Search:
     seeds: int
     """How many runs make a trial; its value is their mean."""
 
+    def config(self, seed: int) -> RunConfig:
+        """The configuration of one run, on the default backend."""
+        every = max(1, self.steps // _EVALUATIONS)
+        return RunConfig(
+            self.env, self.algo, DEFAULT_BACKEND, self.steps, seed, checkpoint_every=every
+        )
+
 
 def open_study(search: Search, folder: Path) -> optuna.Study:
     """The search in a folder, new or as far as it has come.
@@ -81,8 +58,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
     Raises:
         GymMaraError: the folder holds another search.
     """
-    if search.algo not in SPACES:
-        raise unknown("algorithm", search.algo, SPACES)
+    start = preset_of(search.config(FIRST_SEED))
     folder = folder.resolve()  # Optuna's lock is a link, which a relative path would leave dangling
     folder.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
@@ -95,7 +71,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
     about = {name: value for name, value in asdict(search).items() if name != "trials"}
     there = study.user_attrs.get("search")
     if there is None:
-        study.enqueue_trial(values_of(search.algo))
+        study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
         study.set_user_attr("search", about)
     elif there != about:
         raise GymMaraError(f"{str(folder)!r} holds another search: {there}")
@@ -153,13 +129,14 @@ def best(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 
 def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
     """What a trial is worth, the smaller the better: log₁₀ of what its last policies' reward per step falls short of 10."""
-    chosen = {}
-    for name, space in SPACES[search.algo].items():
-        if isinstance(space, list):
-            chosen[name] = trial.suggest_categorical(name, space)
-        else:
-            chosen[name] = trial.suggest_float(name, *space, log=True)
-    preset = with_values(presets.preset(search.algo, teleports=True), chosen)
+    space = algorithm(search.algo).search_space
+    chosen = {
+        name: trial.suggest_float(name, *values, log=True)
+        if isinstance(values, LogRange)
+        else trial.suggest_categorical(name, values)
+        for name, values in {**space.arguments, **space.policy_kwargs}.items()
+    }
+    preset = with_values(preset_of(search.config(FIRST_SEED)), space, chosen)
     values: list[float] = []
     told: list[int] = [0]
 
@@ -174,14 +151,7 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
                 raise optuna.TrialPruned
 
     for seed in range(search.seeds):
-        config = RunConfig(
-            search.env,
-            search.algo,
-            "pinocchio",
-            search.steps,
-            FIRST_SEED + 1000 * trial.number + seed,
-            checkpoint_every=max(1, search.steps // _EVALUATIONS),
-        )
+        config = search.config(FIRST_SEED + 1000 * trial.number + seed)
         with TemporaryDirectory() as folder:
             try:
                 run = train(config, Path(folder) / "run", report, preset=preset)
@@ -192,27 +162,26 @@ def _value(search: Search, say: Say, trial: optuna.Trial) -> float:
     return float(np.mean(values))
 
 
-def with_values(preset: presets.Preset, chosen: dict[str, Any]) -> presets.Preset:
-    """A preset with other values; a learning rate changes over the run as the preset's does."""
+def with_values(preset: Preset, space: SearchSpace, chosen: dict[str, Any]) -> Preset:
+    """A preset with other values of what a search varies; a schedule is scaled so that it starts at its value."""
     arguments = dict(preset.arguments)
     for name, value in chosen.items():
-        if name in _OF_POLICY:
-            arguments["policy_kwargs"] = {**arguments["policy_kwargs"], name: value}
-        elif name == "learning_rate":
-            points = arguments[name]
+        if name in space.policy_kwargs:
+            arguments["policy_kwargs"] = {**arguments.get("policy_kwargs", {}), name: value}
+        elif is_schedule(points := arguments.get(name)):
             arguments[name] = tuple((progress, value * v / points[0][1]) for progress, v in points)
         else:
             arguments[name] = value
     return replace(preset, arguments=arguments)
 
 
-def values_of(algo: str) -> dict[str, Any]:
-    """The values that an algorithm's preset has now, which are tried first."""
-    arguments = presets.preset(algo, teleports=True).arguments
-    given = {**arguments, **arguments["policy_kwargs"]}
-    if isinstance(given["learning_rate"], tuple):
-        given["learning_rate"] = given["learning_rate"][0][1]
-    return {name: given[name] for name in SPACES[algo] if name in given}
+def values_of(preset: Preset, space: SearchSpace) -> dict[str, Any]:
+    """The values that a preset has of what a search varies; of a schedule its first."""
+    given = {**preset.arguments, **preset.arguments.get("policy_kwargs", {})}
+    found = {
+        name: given[name] for name in (*space.arguments, *space.policy_kwargs) if name in given
+    }
+    return {name: v[0][1] if is_schedule(v) else v for name, v in found.items()}
 
 
 def _shortfall(reward_per_step: float) -> float:

@@ -1,4 +1,4 @@
-"""A run's deterministic policy, played step by step, and what is kept of it."""
+"""A run's deterministic policy, played step by step, and the trajectory that it makes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gym_mara.agents.runs.evaluation import MAX_EPISODE_STEPS, make_env
+from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
-
-Floats = NDArray[np.float64]
+from gym_mara.envs.simulation import Outcome
+from gym_mara.tasks import MAX_EPISODE_STEPS
+from gym_mara.types import Floats, Mask
 
 
 class Player:
-    """A run's deterministic policy on N arms of one backend, at the beginning of an episode without end.
+    """A run's deterministic policy on N arms of one backend, at the start of an episode without a time limit.
 
     Use it in a `with` statement.
 
@@ -29,7 +29,7 @@ class Player:
         episodes: N.
 
     Raises:
-        GymMaraError: the policy is missing, damaged or of another environment, or a value is out of its range.
+        GymMaraError: the policy is missing, damaged or of another environment, or an option is unknown or out of range.
     """
 
     def __init__(
@@ -54,15 +54,16 @@ class Player:
 
     def act(self, observation: Floats) -> Floats:
         """The joint targets (N, J), rad, for observations (N, O)."""
-        seen: Any = self._normalisation.normalize_obs(observation)
-        action, _ = self._policy.predict(seen, deterministic=True)
+        normalised: Any = self._normalisation.normalize_obs(observation)
+        action, _ = self._policy.predict(normalised, deterministic=True)
         return self._targets(action)
 
-    def step(self) -> tuple[Floats, dict[str, Any]]:
-        """Take a step; the rewards (N,) and the info."""
-        targets = self.act(self._observation)
-        self._observation, reward, _, _, info = self.env.step(targets)
-        return reward, info
+    def step(self) -> Outcome:
+        """Let the policy act for one step; the outcome holds the state that the task judged."""
+        self._observation, *_ = self.env.step(self.act(self._observation))
+        outcome = self.env.simulation.outcome
+        assert outcome is not None
+        return outcome
 
     def __enter__(self) -> Player:
         return self
@@ -78,7 +79,7 @@ class Player:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """N episodes of T steps."""
+    """N episodes of T steps, as the task judged them: after a collision this is the colliding pose, not the reset one."""
 
     period: float
     """Between two steps, s."""
@@ -87,7 +88,7 @@ class Trajectory:
     qd: Floats
     """(T, N, J), rad/s."""
     torque: Floats
-    """(T, N, J), Nm; NaN on a backend without torques."""
+    """(T, N, J), Nm; NaN on a backend without dynamics."""
     tool: Floats
     """The position of the end-effector frame (T, N, 3), m."""
     position_error: Floats
@@ -96,28 +97,28 @@ class Trajectory:
     """(T, N), rad; NaN where the task has none."""
     reward: Floats
     """(T, N)."""
-    collided: NDArray[np.bool_]
+    collided: Mask
     """(T, N)."""
 
 
-def record(player: Player, steps: int = MAX_EPISODE_STEPS) -> Trajectory:
-    """Play so many steps and keep them."""
-    rows: list[tuple[Any, ...]] = []
-    simulation = player.env.simulation
-    nothing = np.full(player.env.num_envs, np.nan)
-    for _ in range(steps):
-        reward, info = player.step()
-        state = simulation.backend.state
-        rows.append(
-            (
-                state.q,
-                state.qd,
-                info.get("joint_torque", np.full_like(state.q, np.nan)),
-                state.ee_position,
-                info.get("position_error", nothing),
-                info.get("angle_error", nothing),
-                reward,
-                info["collided"],
-            )
-        )
-    return Trajectory(simulation.backend.control_period, *map(np.array, zip(*rows, strict=True)))
+def roll_out(player: Player, steps: int = MAX_EPISODE_STEPS) -> Trajectory:
+    """Let a player's policy act for this many steps."""
+    rows = [_row(player.step()) for _ in range(steps)]
+    period = player.env.simulation.backend.control_period
+    return Trajectory(period, *map(np.array, zip(*rows, strict=True)))
+
+
+def _row(outcome: Outcome) -> tuple[Any, ...]:
+    """One step of a trajectory, in the order of its fields."""
+    state, info = outcome.state, outcome.info
+    absent = np.full(len(state.q), np.nan)
+    return (
+        state.q,
+        state.qd,
+        np.full_like(state.q, np.nan) if state.torque is None else state.torque,
+        state.ee_position,
+        info.get("position_error", absent),
+        info.get("angle_error", absent),
+        outcome.reward,
+        state.collided,
+    )

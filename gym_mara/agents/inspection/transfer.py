@@ -1,83 +1,99 @@
-"""One policy on every backend, side by side: what it loses on the way from a simple simulation to a full one."""
+"""One policy on every backend, side by side: how well it transfers from one simulation to another."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gym_mara.agents.inspection.rollout import Player, record
-from gym_mara.agents.runs.evaluation import options_beyond_backend
+from gym_mara.agents.inspection.rollout import Player, roll_out
+from gym_mara.agents.runs.evaluation import make_env, options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.backends.registry import all_backend_settings
-from gym_mara.errors import GymMaraError
-from gym_mara.robot import RobotModel
+from gym_mara.backends import backend_settings, installed_backends
+from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.types import Floats
 
 SETTLED = 0.005
-"""An arm has settled once its position error stays this near to its last, m."""
+"""An arm has settled once its position error stays this close to its final value, m."""
+_VELOCITY_LIMIT = "max_joint_velocity"
+"""The setting by which a backend whose joints teleport lets them travel."""
 
 
 class Transferred(NamedTuple):
-    """How a policy did on one backend; each (N,), over N episodes."""
+    """How a policy did on one backend; each array is (N,), over N episodes."""
 
     backend: str
-    """Its name, and the settings that are not its defaults."""
-    position_error_mm: NDArray[np.float64]
+    """Its name, and the settings that differ from its defaults."""
+    position_error_mm: Floats
     """At the last step."""
-    angle_deg: NDArray[np.float64]
+    angle_deg: Floats
     """At the last step."""
-    return_: NDArray[np.float64]
-    collisions: NDArray[np.float64]
-    settling_time_s: NDArray[np.float64]
-    """From when on the position error stays within 5 mm of its last."""
-    highest_torque: NDArray[np.float64]
-    """Of any joint, relative to its limit; NaN on a backend without torques."""
-    highest_velocity: NDArray[np.float64]
+    return_: Floats
+    collisions: Floats
+    settling_time_s: Floats
+    """From this time on the position error stays within 5 mm of its final value."""
+    highest_torque: Floats
+    """Of any joint, relative to its limit; NaN on a backend without dynamics."""
+    highest_velocity: Floats
     """Of any joint, rad/s."""
 
 
 def transfer(
     run: RunFolder, *, episodes: int = 1, which: str = "last", options: dict[str, Any] | None = None
 ) -> list[Transferred]:
-    """Play a run's deterministic policy on every backend.
+    """Play a run's deterministic policy on every installed backend.
 
     Args:
         run: the run.
-        episodes: how many on each; they differ only where the options make them random.
+        episodes: how many on each backend; they differ only if the options make them random.
         which: the policy, "last" or "best".
-        options: keyword arguments of the environment; a backend's settings go to the backends that know them.
+        options: settings of backends; each backend gets those that it knows.
 
     Returns:
-        A row for each backend; the kinematic one has two, with teleporting joints and with the robot's velocity limit.
+        A row for each backend. A backend whose joints teleport and that can limit their velocity has a second row, with the
+        robot's lowest velocity limit for all joints.
 
     Raises:
-        GymMaraError: the policy is missing or damaged, or an option is unknown to every backend.
+        GymMaraError: the policy is missing or damaged, or no installed backend knows an option.
     """
-    if episodes < 1:
-        raise GymMaraError(f"episodes must be at least 1, not {episodes}")
+    whole_number("episodes", episodes)
     of_env, given = options_beyond_backend(run.config), options or {}
-    settings = all_backend_settings()
+    installed, reasons = installed_backends()
+    for reason in reasons:
+        warnings.warn(reason, stacklevel=2)
+    settings = {name: backend_settings(name) for name in installed}
     if lost := set(given).difference(*settings.values()):
-        raise GymMaraError(f"no backend knows the setting {min(lost)!r}")
+        raise GymMaraError(
+            f"no installed backend knows the setting {min(lost)!r}; "
+            f"known: {', '.join(sorted(set().union(*settings.values())))}"
+        )
     rows = []
     for name, known in settings.items():
-        chosen = {k: v for k, v in given.items() if k in known}
-        variants = [chosen]
-        if name == "pinocchio" and "max_joint_velocity" not in chosen:
-            robot = RobotModel.load(of_env.get("robot", "mara"), of_env.get("ee_frame"))
-            variants.append({**chosen, "max_joint_velocity": float(robot.velocity_limit.min())})
-        for variant in variants:
+        chosen = {key: value for key, value in given.items() if key in known}
+        for variant in _variants(run.config.env, name, of_env, chosen):
             title = ", ".join([name, *(f"{key}={value}" for key, value in variant.items())])
             rows.append(_play(run, title, name, {**of_env, **variant}, episodes, which))
     return rows
+
+
+def _variants(
+    task: str, backend: str, of_env: dict[str, Any], chosen: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """The settings with which a backend is played: those chosen and, if its joints teleport, with a velocity limit too."""
+    env = make_env(task, backend, 1, {**of_env, **chosen})
+    simulation = env.env.simulation
+    env.close()
+    if not simulation.backend.teleports or _VELOCITY_LIMIT not in backend_settings(backend):
+        return [chosen]
+    return [chosen, {**chosen, _VELOCITY_LIMIT: float(simulation.robot.velocity_limit.min())}]
 
 
 def _play(
     run: RunFolder, title: str, backend: str, options: dict[str, Any], episodes: int, which: str
 ) -> Transferred:
     with Player(run, backend, options, which=which, episodes=episodes) as player:
-        played = record(player)
+        played = roll_out(player)
         effort_limit = player.env.simulation.robot.effort_limit
     return Transferred(
         backend=title,
@@ -91,8 +107,8 @@ def _play(
     )
 
 
-def settled_after(error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The number of steps after which the errors (T, N), m, stay within SETTLED of their last."""
-    astray = np.abs(error - error[-1]) > SETTLED
-    steps = len(error) - astray[::-1].argmax(axis=0)
-    return np.where(astray.any(axis=0), steps, 0).astype(np.float64)
+def settled_after(error: Floats) -> Floats:
+    """The number of steps (N,) after which the errors (T, N), m, stay within SETTLED of their final values."""
+    unsettled = np.abs(error - error[-1]) > SETTLED
+    steps = len(error) - unsettled[::-1].argmax(axis=0)
+    return np.where(unsettled.any(axis=0), steps, 0).astype(np.float64)

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from gym_mara.agents.inspection.rollout import Player
-from gym_mara.agents.runs.evaluation import MAX_EPISODE_STEPS, options_on
+from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.envs import MaraEnv
 from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path
+from gym_mara.viewer import watch
 
 _STILL = 0.5
 """How long a film shows the start pose before the arm moves, s."""
@@ -73,18 +73,8 @@ def _side_by_side(players: list[Player]) -> Any:
 def watch_run(
     run: RunFolder, backend: str, options: dict[str, Any], which: str, speed: float
 ) -> None:
-    """Play a run's policy in the viewer, episode after episode, until it is interrupted."""
+    """Play a run's policy in the viewer, episode after episode, until the user interrupts."""
     settings = {**options_on(backend, run.config), **options}
     with Player(run, backend, settings, which=which) as player:
         act = player.act
-    env = MaraEnv(run.config.env, backend=backend, render_mode="human", **settings)
-    try:
-        observation, _ = env.reset(seed=run.config.seed)
-        assert env.viewer is not None
-        env.viewer.set_speed(speed)
-        while True:
-            for _ in range(MAX_EPISODE_STEPS):
-                observation, *_ = env.step(act(observation[None])[0])
-            observation, _ = env.reset()
-    finally:
-        env.close()
+    watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)

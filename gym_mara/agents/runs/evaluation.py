@@ -15,9 +15,8 @@ from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.tasks import MAX_EPISODE_STEPS
 
-MAX_EPISODE_STEPS = 2048
-"""The length of an episode of the registered environments."""
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
 

@@ -21,7 +21,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, get_origin, get_type_hints
 
-from gym_mara.agents.algorithms.presets import Preset
+from gym_mara.agents.algorithms.base import Preset
+from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
 from gym_mara.errors import GymMaraError, unknown
 
 POLICIES = ("last", "best")
@@ -47,7 +48,7 @@ class RunConfig:
     """How many steps lie between two checkpoints; each is evaluated."""
     env_options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment besides `backend`."""
-    preset_name: str = "tuned"
+    preset_name: str = DEFAULT_PRESET
     preset: dict[str, Any] = field(default_factory=dict)
     """The preset as it was, so that a later change of it does not change the run."""
 

@@ -15,18 +15,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import TRPO
-from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
-from gym_mara.agents.algorithms.acktr import ACKTR
-from gym_mara.agents.algorithms.natural_gaussian import NaturalGaussianPolicy
-from gym_mara.agents.algorithms.presets import Preset
+from gym_mara.agents.algorithms.base import Preset, policy_class
+from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, replace_folder
 from gym_mara.agents.sb3 import MaraVecEnv
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError
 
 # What reading a pickle or a zip that was cut short or overwritten raises; others than ValueError, which tells of a misfit.
 DAMAGE = (
@@ -41,23 +38,6 @@ DAMAGE = (
     zlib.error,
     pickle.UnpicklingError,
 )
-
-ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {"ppo": PPO, "trpo": TRPO, "acktr": ACKTR}
-POLICY_CLASSES: dict[str, type[ActorCriticPolicy]] = {
-    "mlp": ActorCriticPolicy,
-    "natural": NaturalGaussianPolicy,
-}
-
-
-def algorithm_class(name: str) -> type[OnPolicyAlgorithm]:
-    """The class of an algorithm.
-
-    Raises:
-        GymMaraError: there is no such algorithm.
-    """
-    if name not in ALGORITHMS:
-        raise unknown("algorithm", name, ALGORITHMS)
-    return ALGORITHMS[name]
 
 
 def policy_arguments(preset: Preset) -> dict[str, Any]:
@@ -95,7 +75,7 @@ def load_policy(
         GymMaraError: the policy is one of another environment.
     """
     preset = Preset(**config.preset)
-    make = POLICY_CLASSES[preset.policy]
+    make = policy_class(preset.policy)
     arguments = policy_arguments(preset)
     policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
     with _told(folder):
@@ -117,7 +97,9 @@ def load_model(folder: Path, algo: str, env: MaraVecEnv) -> tuple[OnPolicyAlgori
     with _told(folder):
         wrapped = _normalised(folder, env, training=True)
         file = folder / "model.zip"
-        model = algorithm_class(algo).load(file, env=wrapped, device="cpu", force_reset=False)
+        model = (
+            algorithm(algo).load_class().load(file, env=wrapped, device="cpu", force_reset=False)
+        )
     return model, wrapped
 
 

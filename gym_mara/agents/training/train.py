@@ -24,15 +24,11 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
-from gym_mara.agents.algorithms import presets
+from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
+from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
-from gym_mara.agents.runs.policy import (
-    POLICY_CLASSES,
-    algorithm_class,
-    load_model,
-    policy_arguments,
-)
+from gym_mara.agents.runs.policy import load_model, policy_arguments
 from gym_mara.agents.training.callbacks import (
     Keeper,
     Report,
@@ -43,7 +39,7 @@ from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 
 def train(
-    config: RunConfig, out: Path, report: Report, *, preset: presets.Preset | None = None
+    config: RunConfig, out: Path, report: Report, *, preset: Preset | None = None
 ) -> RunFolder:
     """Train an agent into a new run folder.
 
@@ -62,17 +58,28 @@ def train(
             raise GymMaraError(f"{name} must be at least 1, not {getattr(config, name)}")
     if not 0 <= config.seed < 2**32:
         raise GymMaraError(f"seed must be a whole number from 0 to 2**32 - 1, not {config.seed}")
-    algorithm_class(config.algo)  # before any backend is built
-    if preset is None:
-        probe = make_env(config.env, config.backend, 1, config.env_options)
-        teleports = probe.env.simulation.backend.teleports
-        preset = presets.preset(config.algo, config.preset_name, teleports=teleports)
-        probe.close()
+    algorithm(config.algo)  # an unknown name is an error before anything is built
+    preset = preset or preset_of(config)
     config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
     model = new_model(config)  # before the folder: what cannot be built leaves none behind
     run = RunFolder.create(out, config)
     with _alone(run):
         return _learn(run, model, report=report)
+
+
+def preset_of(config: RunConfig) -> Preset:
+    """The preset that a configuration names, for joints that teleport or travel as in its environment.
+
+    Raises:
+        GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
+    """
+    pair = algorithm(config.algo).preset_pair(config.preset_name)
+    env = make_env(config.env, config.backend, 1, config.env_options)
+    try:
+        teleports = env.env.simulation.backend.teleports
+    finally:
+        env.close()
+    return pair.teleporting if teleports else pair.travelling
 
 
 def resume(path: Path, report: Report) -> RunFolder:
@@ -93,7 +100,7 @@ def _go_on(run: RunFolder, report: Report) -> RunFolder:
     if not checkpoints:
         return _learn(run, new_model(config), report=report)
     use_one_thread()
-    preset = presets.Preset(**config.preset)
+    preset = Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     model, wrapped = load_model(checkpoints[-1], config.algo, env)
     if model.num_timesteps >= config.steps and run.has_policy("last"):
@@ -133,12 +140,12 @@ def _alone(run: RunFolder) -> Iterator[None]:
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
     """An untrained agent, with its environment, as a configuration asks for it."""
-    preset = presets.Preset(**config.preset)
+    preset = Preset(**config.preset)
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     return new_agent(config.algo, preset, env, config.seed)
 
 
-def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
+def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
     """An untrained agent of an algorithm and a preset on any environment of Stable-Baselines3."""
     use_one_thread()
     wrapped = VecNormalize(
@@ -146,8 +153,8 @@ def new_agent(algo: str, preset: presets.Preset, env: VecEnv, seed: int) -> OnPo
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     arguments["policy_kwargs"] = policy_arguments(preset)
-    policy = POLICY_CLASSES[preset.policy]
-    return algorithm_class(algo)(policy, wrapped, seed=seed, device="cpu", **arguments)
+    policy = policy_class(preset.policy)
+    return algorithm(algo).load_class()(policy, wrapped, seed=seed, device="cpu", **arguments)
 
 
 def use_one_thread() -> None:
@@ -167,9 +174,8 @@ class PiecewiseLinear:
 
 
 def _schedule(value: Any) -> Any:
-    """A preset's value as the algorithm wants it."""
-    is_points = isinstance(value, (tuple, list)) and value and isinstance(value[0], (tuple, list))
-    return PiecewiseLinear(value) if is_points else value
+    """A preset's value in the form that the algorithm takes."""
+    return PiecewiseLinear(value) if is_schedule(value) else value
 
 
 def _learn(

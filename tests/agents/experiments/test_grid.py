@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from gym_mara.agents.algorithms.presets import PRESETS
+from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.experiments import grid as benchmark
 from gym_mara.agents.experiments.figures import format_interval, interquartile_mean, plot_grid
 from gym_mara.agents.experiments.grid import Grid, open_grid, read_result, run_grid
@@ -159,8 +159,9 @@ def test_the_folder_of_another_grid_is_refused(
 ) -> None:
     with pytest.raises(GymMaraError, match=r"another grid .*steps 4096 there, 8192 now"):
         open_grid(finished_grid, replace(GRID, steps=8192))
-    changed = {"ppo": PRESETS["paper"]["ppo"], "acktr": PRESETS["tuned"]["acktr"]}
-    monkeypatch.setitem(PRESETS, "tuned", changed)
+    ppo = algorithm("ppo")
+    changed = replace(ppo, presets={"tuned": ppo.presets["paper"]})
+    monkeypatch.setitem(ALGORITHMS, "ppo", changed)
     with pytest.raises(GymMaraError, match="made with other 'tuned' presets"):
         open_grid(finished_grid, GRID)
     (tmp_path / "something").touch()
@@ -194,6 +195,7 @@ def test_figures_and_tables_show_every_run(finished_grid: Path, tmp_path: Path) 
     assert {file.name for file in files} == {
         "MARA-v0.png",
         "MARA-v0_acktr.png",
+        "MARA-v0_ppo.png",
         "curves.csv",
         "table.csv",
         "table.md",
@@ -210,7 +212,7 @@ def test_a_finished_run_that_is_damaged_later_is_named(finished_grid: Path, tmp_
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
-    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it anew"):
+    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it again"):
         plot_grid(folder)
 
 
@@ -221,7 +223,7 @@ def test_what_has_not_finished_is_left_out_of_the_figures(
     shutil.copytree(finished_grid, folder)
     (folder / "MARA-v0_acktr_0" / "result.json").unlink()
     files = {file.name for file in plot_grid(folder)}
-    assert files == {"MARA-v0.png", "curves.csv", "table.csv", "table.md"}
+    assert files == {"MARA-v0.png", "MARA-v0_ppo.png", "curves.csv", "table.csv", "table.md"}
 
 
 def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from gym_mara.agents.algorithms import presets
+from gym_mara.agents.algorithms.base import LogRange
+from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.experiments import search as module
 from gym_mara.agents.experiments.search import (
     FIRST_SEED,
-    SPACES,
     Search,
     best,
     finished,
@@ -24,7 +24,6 @@ from gym_mara.agents.experiments.search import (
     work,
 )
 from gym_mara.agents.runs.evaluation import make_env
-from gym_mara.agents.runs.policy import algorithm_class
 from gym_mara.agents.training.train import new_agent, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
@@ -57,10 +56,12 @@ def test_a_search_goes_on_where_it_was_cut_off(
 
 def test_a_trial_that_was_killed_is_tried_again(tmp_path: Path) -> None:
     study = open_study(SMALL, tmp_path)
-    first = values_of("acktr")
+    acktr = algorithm("acktr")
+    space = acktr.search_space
+    first = values_of(acktr.preset("tuned", teleports=True), space)
     study.ask()  # and never told
     killed = study.ask()
-    killed.suggest_float("learning_rate", *SPACES["acktr"]["learning_rate"], log=True)
+    killed.suggest_float("learning_rate", *space.arguments["learning_rate"], log=True)
     assert run_search(SMALL, tmp_path, 1, deaf) == {}
     trials = open_study(SMALL, tmp_path).get_trials()
     assert not any(trial.state.name == "RUNNING" for trial in trials)
@@ -147,14 +148,15 @@ def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
         open_study(Search(**{**vars(SMALL), "algo": "ppo2"}), tmp_path / "other")
 
 
-@pytest.mark.parametrize("algo", SPACES)
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_value_of_a_space_is_one_that_the_algorithm_takes(algo: str) -> None:
+    space = algorithm(algo).search_space
     chosen = {
-        name: space[-1] if isinstance(space, list) else space[1]
-        for name, space in SPACES[algo].items()
+        name: values.high if isinstance(values, LogRange) else values[-1]
+        for name, values in {**space.arguments, **space.policy_kwargs}.items()
     }
-    preset = with_values(presets.preset(algo, teleports=True), chosen)
+    preset = with_values(algorithm(algo).preset("tuned", teleports=True), space, chosen)
     env = make_env("MARA-v0", "pinocchio", preset.num_envs, {})
     model = new_agent(algo, preset, env, seed=0)
-    assert isinstance(model, algorithm_class(algo))
+    assert isinstance(model, algorithm(algo).load_class())
     assert model.n_steps == chosen["n_steps"]

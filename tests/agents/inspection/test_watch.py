@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import signal
 import sys
 import time
@@ -175,11 +177,24 @@ def test_without_dart_a_report_says_what_is_missing(
     monkeypatch.setitem(sys.modules, "dartpy", None)
     text = write_report(finished_run, tmp_path / "report.html").read_text()
     assert "gym_mara[dart]" in text
-    assert "has torques; the backend dart has" in text
+    assert "No installed backend simulates torques" in text
+
+
+def test_a_report_escapes_the_texts_of_a_run(finished_run: RunFolder, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished_run.path, run)
+    hostile = "</pre><script>alert('a & b')</script>"
+    values = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(values | {"preset_name": hostile}))
+    text = write_report(RunFolder.open(run)).read_text()
+    assert hostile not in text
+    escaped = "&lt;/pre&gt;&lt;script&gt;alert(&#39;a &amp; b&#39;)&lt;/script&gt;"
+    assert text.count(escaped) == 2, "once in the subtitle, once in the configuration"
 
 
 def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "gym_mara.agents.inspection.report")
+    for name in ("report", "report_figures"):
+        monkeypatch.delitem(sys.modules, f"gym_mara.agents.inspection.{name}")
     monkeypatch.setitem(sys.modules, "plotly", None)
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     with pytest.raises(MissingExtraError, match=r"gym_mara\[render\]"):

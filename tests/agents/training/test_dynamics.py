@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gym_mara.agents.algorithms.presets import Preset
+from gym_mara.agents.algorithms.base import Preset
 from gym_mara.agents.inspection.transfer import SETTLED, settled_after, transfer
 from gym_mara.agents.runs.evaluation import evaluate_run, make_env
 from gym_mara.agents.runs.folder import RunFolder

@@ -19,10 +19,11 @@ from filelock import FileLock
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gym_mara.agents.algorithms import presets
+from gym_mara.agents.algorithms.base import Preset
+from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.evaluation import METRICS, evaluate_run, make_env, spread
 from gym_mara.agents.runs.folder import DamagedRunError, RunFolder, read_progress
-from gym_mara.agents.runs.policy import POLICY_CLASSES, load_policy
+from gym_mara.agents.runs.policy import load_policy
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.training import callbacks
 from gym_mara.agents.training import train as train_module
@@ -355,8 +356,7 @@ def test_a_configuration_of_another_form_is_named(
 
 def test_a_preset_of_an_unknown_policy_is_refused() -> None:
     with pytest.raises(GymMaraError, match=r"unknown policy 'mpl'\. Did you mean 'mlp'"):
-        presets.Preset(num_envs=1, policy="mpl")
-    assert tuple(POLICY_CLASSES) == presets.POLICY_FORMS
+        Preset(num_envs=1, policy="mpl")
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(
@@ -413,7 +413,7 @@ def test_a_resumed_tensorboard_log_has_every_step_once(
 def test_a_training_that_diverges_says_so(
     tmp_path: Path, algo: str, preset_name: str, wild: dict[str, float]
 ) -> None:
-    preset = presets.preset(algo, preset_name, teleports=True)
+    preset = algorithm(algo).preset(preset_name, teleports=True)
     preset = replace(preset, arguments={**preset.arguments, **wild})
     asked = config(algo=algo, steps=6000, checkpoint_every=6000)
     with pytest.raises(TrainingDivergedError, match="finite"):

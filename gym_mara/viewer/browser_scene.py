@@ -8,22 +8,25 @@ import numpy as np
 import pinocchio as pin
 import viser
 
-from gym_mara.rendering.look import BACKGROUND, VIEW_ANGLE, Look
-from gym_mara.rendering.scene import Colour, Floats, Scene
-from gym_mara.state import View
+from gym_mara.rendering.camera import BACKGROUND, VIEW_ANGLE, Camera
+from gym_mara.rendering.scene import Colour, Scene
+from gym_mara.rendering.view import View
+from gym_mara.types import Floats
 
 
-class Stage:
-    """The parts of a scene as nodes of a viser server, a link's under one node; the target hangs on a handle to drag.
+class BrowserScene:
+    """The parts of a scene as nodes of a viser server. Each link is a node with its parts as children.
+
+    The target has a handle that the user can drag.
 
     Args:
-        server: where they are shown.
-        scene: what there is to see.
-        look: from where a browser sees it first.
-        view: how it stands at first.
+        server: the viser server that shows the scene.
+        scene: the parts to show.
+        camera: the initial camera of a browser.
+        view: the first view.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, look: Look, view: View) -> None:
+    def __init__(self, server: viser.ViserServer, scene: Scene, camera: Camera, view: View) -> None:
         self._server, self._scene = server, scene
         server.scene.set_up_direction("+z")
         server.scene.configure_default_lights(cast_shadow=True)
@@ -32,14 +35,14 @@ class Stage:
             "/floor",
             width=4.0,
             height=4.0,
-            position=look.floor,
+            position=camera.floor,
             cell_color=(210, 214, 218),
             section_color=(190, 195, 200),
             shadow_opacity=0.2,
         )
-        camera = server.initial_camera
-        camera.position, camera.look_at = tuple(look.eye), tuple(look.at)
-        camera.fov = float(np.radians(VIEW_ANGLE))
+        initial = server.initial_camera
+        initial.position, initial.look_at = tuple(camera.eye), tuple(camera.at)
+        initial.fov = float(np.radians(VIEW_ANGLE))
         self.target = server.scene.add_transform_controls(
             "/target",
             scale=0.2,
@@ -48,17 +51,18 @@ class Stage:
             wxyz=view.target_quaternion,
         )
         self._nodes: dict[str, Any] = {"target": self.target}
-        self._leaders: dict[str, int] = {}
+        self._first_parts: dict[str, int] = {}
         self._meshes: list[Any] = []
         placements = scene.placements(view)
         for index, part in enumerate(scene.parts):
-            if part.link not in self._leaders:  # the link's first part leads the others
-                self._leaders[part.link] = index
+            if part.link not in self._first_parts:
+                # The link's node has the pose of its first part.
+                self._first_parts[part.link] = index
                 if part.link not in self._nodes:
                     node = server.scene.add_frame(f"/{part.link}", show_axes=False)
                     self._nodes[part.link] = node
-            leader = placements[self._leaders[part.link]]
-            wxyz, position = _pose(np.linalg.inv(leader) @ placements[index])
+            node_pose = placements[self._first_parts[part.link]]
+            wxyz, position = _pose(np.linalg.inv(node_pose) @ placements[index])
             self._meshes.append(
                 server.scene.add_mesh_simple(
                     f"/{part.link}/{index}",
@@ -76,13 +80,13 @@ class Stage:
         self.show(view)
 
     def show(self, view: View) -> None:
-        """Move everything but the target, which the user's hand moves, to where it is in a view."""
+        """Move the links to their poses in a view, and colour them. The target stays: the user moves it."""
         placements = self._scene.placements(view)
         with self._server.atomic():
-            for link, leader in self._leaders.items():
+            for link, first_part in self._first_parts.items():
                 if link != "target":
                     node = self._nodes[link]
-                    node.wxyz, node.position = _pose(placements[leader])
+                    node.wxyz, node.position = _pose(placements[first_part])
             for index, colour in enumerate(self._scene.colours(view)):
                 if colour != self._colours[index]:
                     self._meshes[index].color = _bytes(colour)
@@ -90,11 +94,12 @@ class Stage:
 
 
 def _bytes(colour: Colour) -> tuple[int, int, int]:
+    """A colour as integers from 0 to 255."""
     red, green, blue = (round(255 * value) for value in colour)
     return red, green, blue
 
 
 def _pose(placement: Floats) -> tuple[Floats, Floats]:
-    """A homogeneous matrix (4, 4) as quaternion [w, x, y, z] and position."""
+    """The quaternion (4,), [w, x, y, z], and the position (3,) of a homogeneous matrix (4, 4)."""
     x, y, z, w = pin.Quaternion(placement[:3, :3]).coeffs()
     return np.array([w, x, y, z]), placement[:3, 3].copy()

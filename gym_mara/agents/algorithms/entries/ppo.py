@@ -1,0 +1,84 @@
+"""PPO: its presets and its search space."""
+
+from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, PresetPair, SearchSpace
+from gym_mara.agents.algorithms.entries import PAPER_NETWORK
+
+# Where joints teleport, the next state depends on the action alone, so future rewards are not discounted in (γ = 0).
+# Many arms and short rollouts: once the tool is in place, the policy finds the angle by moving along a narrow curved
+# valley, a fraction of its standard deviation per update. Many updates then matter more than accurate ones.
+_TELEPORTING = Preset(
+    num_envs=256,
+    policy="natural",
+    arguments={
+        "n_steps": 2,
+        "batch_size": 256,
+        "n_epochs": 2,
+        "gamma": 0.0,
+        "learning_rate": ((0.0, 0.06), (0.7, 0.06), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "vf_coef": 0.1,
+        "max_grad_norm": 10.0,
+        "policy_kwargs": {
+            "net_arch": [64, 64],
+            "log_std_init": -2.0,
+            "covariance_rate": 1.3,
+            "widening": 0.1,
+        },
+    },
+)
+# Where joints travel, an action is rewarded some tenths of a second later. Few arms, so that each completes many episodes.
+# The critic's errors are as large as the returns; plain gradient descent becomes unstable with them, hence Adam.
+_TRAVELLING = Preset(
+    num_envs=16,
+    policy="natural",
+    arguments={
+        "n_steps": 256,
+        "batch_size": 512,
+        "n_epochs": 10,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 2e-3), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "policy_kwargs": {
+            "net_arch": [64, 64],
+            "log_std_init": -1.5,
+            "optimizer_class": "Adam",
+        },
+    },
+)
+_PAPER = Preset(
+    num_envs=8,
+    arguments={
+        "n_steps": 256,
+        "batch_size": 512,
+        "n_epochs": 10,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 3e-3), (1.0, 0.0)),
+        "clip_range": 0.25,
+        "vf_coef": 1.0,
+        "policy_kwargs": PAPER_NETWORK,
+    },
+)
+
+ALGORITHM = Algorithm(
+    name="ppo",
+    summary="proximal policy optimisation, from Stable-Baselines3",
+    target="stable_baselines3:PPO",
+    presets={
+        "tuned": PresetPair(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "paper": PresetPair(teleporting=_PAPER, travelling=_PAPER),
+    },
+    search_space=SearchSpace(
+        arguments={
+            "n_steps": [1, 2, 4, 8],
+            "batch_size": [256, 512],
+            "n_epochs": [1, 2, 4],
+            "learning_rate": LogRange(1e-2, 2e-1),
+        },
+        policy_kwargs={
+            "covariance_rate": LogRange(0.5, 3.0),
+            "widening": LogRange(0.02, 0.2),
+        },
+    ),
+)

@@ -1,0 +1,64 @@
+"""End-effector poses that an arm can take without a collision: random ones, and a fixed one for each robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gym_mara.collision.coal import CoalChecker
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.types import Floats
+
+_TRIES = 10_000
+
+
+class FreePoses:
+    """Draws end-effector poses from the arm's collision-free configurations.
+
+    Args:
+        robot: the arm.
+    """
+
+    def __init__(self, robot: RobotModel) -> None:
+        self._robot = robot
+        self._checker = CoalChecker(robot)
+        self._kinematics = robot.kinematics()
+        self._low, self._high = _range(robot)
+
+    def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+        """Position (3,), m, and quaternion (4,), [w, x, y, z], at a configuration drawn uniformly from all free ones.
+
+        Raises:
+            GymMaraError: none of many random configurations is free.
+        """
+        for _ in range(_TRIES):
+            q = generator.uniform(self._low, self._high)[None]
+            if not self._checker.check(q)[0]:
+                position, quaternion = self._kinematics.pose(q)
+                return position[0], quaternion[0]
+        raise GymMaraError(
+            f"{self._robot.name} collides at all of {_TRIES} random configurations; "
+            "check which pairs of links its SRDF disables"
+        )
+
+
+def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
+    """The end-effector pose, position (3,), m, and quaternion (4,), [w, x, y, z], of a collision-free configuration.
+
+    Always the same for a robot: the first of a fixed sequence, in the middle half of the joints' ranges, that is free
+    and moves the tool away from home. The home pose where there is none.
+    """
+    low, high = _range(robot)
+    rng = np.random.default_rng(0)
+    candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
+    candidates = np.vstack([candidates, robot.home])
+    position, quaternion = robot.kinematics().pose(candidates)
+    away = np.linalg.norm(position - position[-1], axis=1)
+    good = ~CoalChecker(robot).check(candidates) & (away > 0.25 * away.max())
+    chosen = int(good.argmax()) if good.any() else len(candidates) - 1
+    return position[chosen], quaternion[chosen]
+
+
+def _range(robot: RobotModel) -> tuple[Floats, Floats]:
+    """The lowest and the highest configuration (J,), rad, that an action can ask for."""
+    return np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)

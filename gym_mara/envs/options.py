@@ -1,0 +1,82 @@
+"""The keyword arguments of the environments, sorted once into those of each room."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from gym_mara.backends import backend_settings
+from gym_mara.envs.sensors import SensorSettings
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.rendering import RenderSettings
+from gym_mara.robot import RobotLike, RobotModel
+from gym_mara.tasks import Task, named_task
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an environment is made of."""
+
+    task: Task
+    robot: RobotModel
+    backend: str
+    """The name of the backend."""
+    settings: dict[str, Any]
+    """The backend's keyword arguments."""
+    sensors: SensorSettings
+    rendering: RenderSettings
+
+    @classmethod
+    def sort(
+        cls,
+        task: str | Task,
+        robot: RobotLike,
+        ee_frame: str | None,
+        backend: str,
+        keywords: dict[str, Any],
+    ) -> Options:
+        """Give each room its own keyword arguments.
+
+        Args:
+            task: the name of a task, or a task.
+            robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
+            ee_frame: the end-effector link of a URDF of your own.
+            backend: the name of a backend.
+            keywords: values of the task, settings of the backend, of the sensors and of rendering.
+
+        Raises:
+            GymMaraError: a name is unknown, or a value is out of its range.
+            MissingExtraError: a library is not installed.
+        """
+        chosen = named_task(task)
+        rooms = {
+            "task": _names(chosen),
+            "backend": backend_settings(backend),
+            "sensors": _names(SensorSettings),
+            "rendering": _names(RenderSettings),
+        }
+        own: dict[str, dict[str, Any]] = {room: {} for room in rooms}
+        for name, value in keywords.items():
+            owners = [room for room, names in rooms.items() if name in names]
+            if not owners:
+                valid = [name for names in rooms.values() for name in names]
+                raise unknown("keyword argument", name, valid, f" with backend {backend!r}")
+            if len(owners) > 1:
+                raise GymMaraError(
+                    f"the keyword argument {name!r} belongs to the {' and the '.join(owners)}: rename it in one of them"
+                )
+            own[owners[0]][name] = value
+        return cls(
+            task=dataclasses.replace(chosen, **own["task"]),
+            robot=RobotModel.load(robot, ee_frame),
+            backend=backend,
+            settings=own["backend"],
+            sensors=SensorSettings(**own["sensors"]),
+            rendering=RenderSettings(**own["rendering"]),
+        )
+
+
+def _names(form: Any) -> list[str]:
+    """The names of a dataclass's fields."""
+    return [field.name for field in dataclasses.fields(form)]

@@ -1,0 +1,109 @@
+"""Sensors: the joint encoders' noise, between the state and its observation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gym_mara.envs.streams import Streams
+from gym_mara.errors import positive_number
+from gym_mara.robot import RobotModel
+from gym_mara.state import SimState
+from gym_mara.types import Floats, Mask
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorSettings:
+    """What a user may choose of the sensors; each is a keyword argument of the environments.
+
+    Raises:
+        GymMaraError: a value is out of its range.
+    """
+
+    velocity_filter: float = 0.0
+    """The time constant of the low-pass filter of measured velocities, s; 0 for none."""
+
+    def __post_init__(self) -> None:
+        positive_number("velocity_filter", self.velocity_filter, "s", or_zero=True)
+
+
+class Sensors:
+    """The encoders of N arms: positions with Gaussian noise, velocities by finite differences of these.
+
+    Measured values are clipped to the limits of the joints. The end effector's pose and velocity are those of the
+    measured joints. The first measurement of an episode is of an arm at rest.
+
+    Args:
+        robot: the arm.
+        num_envs: N.
+        period: between two measurements, s.
+        joint_velocity: how fast the joints can be (J,), rad/s.
+        settings: what the user has chosen.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        num_envs: int,
+        period: float,
+        joint_velocity: Floats,
+        settings: SensorSettings,
+    ) -> None:
+        self._robot, self._period, self._joint_velocity = robot, period, joint_velocity
+        self._kinematics = robot.kinematics()
+        # An exponential filter in discrete time: v += (1 - e^(-T/τ)) (difference/T - v).
+        filtered = settings.velocity_filter
+        self._weight = 1.0 - np.exp(-period / filtered) if filtered else 1.0
+        self._q = np.zeros((num_envs, robot.num_joints))
+        self._qd = np.zeros_like(self._q)
+
+    def begin(self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask) -> None:
+        """Measure the chosen arms, which were put at rest at q (N, J), rad.
+
+        Args:
+            q: the configurations (N, J), rad; the rows of other arms do not count.
+            noise: the standard deviation of each arm's measured positions (N,), rad.
+            streams: each arm's sources of randomness.
+            arms: which arms.
+        """
+        self._q[arms] = self._positions(q, noise, streams, arms)[arms]
+        self._qd[arms] = 0.0
+
+    def measure(self, q: Floats, noise: Floats, streams: Sequence[Streams]) -> None:
+        """Measure all arms one period after their last measurement; the arguments are those of `begin`."""
+        measured = self._positions(q, noise, streams, np.ones(len(q), np.bool_))
+        self._qd += self._weight * ((measured - self._q) / self._period - self._qd)
+        self._q = measured
+
+    def seen(self, state: SimState) -> SimState:
+        """A state as the last measurements show it."""
+        q = self._q.copy()
+        qd = self._qd.clip(-self._joint_velocity, self._joint_velocity)
+        position, quaternion = self._kinematics.pose(q)
+        return dataclasses.replace(
+            state,
+            q=q,
+            qd=qd,
+            ee_position=position,
+            ee_quaternion=quaternion,
+            ee_velocity=self._kinematics.velocity(q, qd),
+        )
+
+    def _positions(
+        self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask
+    ) -> Floats:
+        measured = q.copy()
+        for arm in np.flatnonzero(arms).tolist():
+            measured[arm] += noise[arm] * streams[arm].sensors.standard_normal(q.shape[1])
+        return measured.clip(self._robot.lower, self._robot.upper)
+
+    def save(self) -> dict[str, Any]:
+        """A snapshot."""
+        return {"q": self._q.copy(), "qd": self._qd.copy()}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot."""
+        self._q, self._qd = snapshot["q"].copy(), snapshot["qd"].copy()

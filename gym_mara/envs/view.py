@@ -1,0 +1,20 @@
+"""From a simulation to a View, which renderers and the viewer show."""
+
+from __future__ import annotations
+
+from gym_mara.envs.simulation import Simulation
+from gym_mara.rendering.view import View
+
+
+def view_of(simulation: Simulation, arm: int) -> View:
+    """An arm as its last observation shows it: where it collided and was put back, it still collides there."""
+    state, goal = simulation.observed(arm), simulation.goal
+    touching: frozenset[str] = frozenset()
+    if state.collided[arm]:
+        if state.contacts is not None:
+            touching = frozenset(link for contact in state.contacts[arm] for link in contact.links)
+        if not touching:
+            from gym_mara.collision.coal import touching_links
+
+            touching = touching_links(simulation.robot, state.q[arm])
+    return View(state.q[arm], goal.position[arm], goal.quaternion[arm], touching)

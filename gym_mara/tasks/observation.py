@@ -1,0 +1,166 @@
+"""Observations: named parts with bounds, concatenated into one array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from gym_mara.errors import GymMaraError
+from gym_mara.state import SimState
+from gym_mara.types import Floats
+
+if TYPE_CHECKING:
+    from gym_mara.robot import RobotModel
+    from gym_mara.tasks.base import Goal
+
+_ONE = 1.0 + 1e-9
+"""The bound of a unit quaternion's components, with a margin for rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A named part of an observation, with its bounds."""
+
+    name: str
+    low: Floats
+    """The lower bounds (K,)."""
+    high: Floats
+    """The upper bounds (K,)."""
+    values: Callable[[SimState, Goal], Floats]
+    """Computes the values (N, K) for N arms. It must be a module-level function, so that environments can be pickled."""
+
+
+class Observation:
+    """Concatenates parts into one flat array.
+
+    Args:
+        parts: the parts, in order.
+
+    Raises:
+        GymMaraError: two parts have the same name, or a part's bounds differ in shape.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        names = [part.name for part in parts]
+        if len(set(names)) < len(names):
+            raise GymMaraError(f"two parts of an observation have the same name: {names}")
+        for part in parts:
+            if np.ndim(part.low) != 1 or np.shape(part.low) != np.shape(part.high):
+                raise GymMaraError(
+                    f"the bounds of {part.name!r} must be two arrays of the same shape (K,), "
+                    f"not {np.shape(part.low)} and {np.shape(part.high)}"
+                )
+        self.parts = tuple(parts)
+        low, high = (
+            np.concatenate([part.low for part in parts]),
+            np.concatenate([part.high for part in parts]),
+        )
+        self.space = Box(low, high, dtype=np.float64)
+        """The space of one flat observation (O,)."""
+        self._ends = np.cumsum([len(part.low) for part in parts]).tolist()
+
+    def __call__(self, state: SimState, goal: Goal) -> Floats:
+        """Compute the flat observations (N, O) of N arms, a fresh array."""
+        return np.concatenate([part.values(state, goal) for part in self.parts], axis=-1)
+
+    def split(self, flat: Floats) -> dict[str, Floats]:
+        """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""
+        starts = [0, *self._ends[:-1]]
+        return {
+            part.name: flat[..., start:end]
+            for part, start, end in zip(self.parts, starts, self._ends, strict=True)
+        }
+
+
+def joint_positions(robot: RobotModel) -> Part:
+    """The joint positions (J,), rad (m for a prismatic joint)."""
+    return Part("joint_positions", robot.lower, robot.upper, _joint_positions)
+
+
+def position_error(robot: RobotModel, farthest: float) -> Part:
+    """The position of the end effector minus the position of the target (3,), m.
+
+    Args:
+        robot: the arm.
+        farthest: the largest possible distance of a target from the world's origin, m.
+    """
+    return _symmetric("position_error", robot.extent + farthest, _position_error)
+
+
+def orientation_error() -> Part:
+    """The rotation from the target to the end effector, q_ee ⊗ conj(q_target) (4,), [w, x, y, z], w >= 0."""
+    return _quaternion("orientation_error", _orientation_error)
+
+
+def tool_velocity(robot: RobotModel, joint_velocity: Floats) -> Part:
+    """The linear velocity of the end effector (3,), m/s.
+
+    Args:
+        robot: the arm.
+        joint_velocity: the largest speed of each joint (J,), rad/s.
+    """
+    return _symmetric("tool_velocity", float((robot.reach * joint_velocity).sum()), _tool_velocity)
+
+
+def tool_position(robot: RobotModel) -> Part:
+    """The position of the end effector in the world frame (3,), m."""
+    return _symmetric("tool_position", robot.extent, _tool_position)
+
+
+def tool_quaternion() -> Part:
+    """The orientation of the end effector in the world frame (4,), [w, x, y, z], w >= 0."""
+    return _quaternion("tool_quaternion", _tool_quaternion)
+
+
+def target_position(robot: RobotModel) -> Part:
+    """The position of the target in the world frame (3,), m, for targets within reach."""
+    return _symmetric("target_position", robot.extent, _target_position)
+
+
+def target_quaternion() -> Part:
+    """The orientation of the target in the world frame (4,), [w, x, y, z], w >= 0."""
+    return _quaternion("target_quaternion", _target_quaternion)
+
+
+def _symmetric(name: str, bound: float, values: Callable[[SimState, Goal], Floats]) -> Part:
+    return Part(name, np.full(3, -bound), np.full(3, bound), values)
+
+
+def _quaternion(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:
+    return Part(name, np.array([0.0, -_ONE, -_ONE, -_ONE]), np.full(4, _ONE), values)
+
+
+def _joint_positions(state: SimState, goal: Goal) -> Floats:
+    return state.q
+
+
+def _position_error(state: SimState, goal: Goal) -> Floats:
+    return state.ee_position - goal.position
+
+
+def _orientation_error(state: SimState, goal: Goal) -> Floats:
+    return goal.orientation_error(state.ee_quaternion)
+
+
+def _tool_velocity(state: SimState, goal: Goal) -> Floats:
+    return state.ee_velocity
+
+
+def _tool_position(state: SimState, goal: Goal) -> Floats:
+    return state.ee_position
+
+
+def _tool_quaternion(state: SimState, goal: Goal) -> Floats:
+    return state.ee_quaternion
+
+
+def _target_position(state: SimState, goal: Goal) -> Floats:
+    return goal.position
+
+
+def _target_quaternion(state: SimState, goal: Goal) -> Floats:
+    return goal.quaternion

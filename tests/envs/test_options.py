@@ -1,0 +1,45 @@
+"""Keyword arguments: each goes to its room, once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.options import Options
+from gym_mara.errors import GymMaraError
+from gym_mara.tasks import ReachTask
+
+
+def test_each_room_gets_its_own() -> None:
+    keywords = {"alpha": 4.0, "path_resolution": 0.01, "width": 320, "velocity_filter": 0.1}
+    options = Options.sort("MARA-v0", "mara", None, "pinocchio", keywords)
+    assert isinstance(options.task, ReachTask)
+    assert options.task.alpha == 4.0
+    assert options.settings == {"path_resolution": 0.01}
+    assert options.rendering.width == 320
+    assert options.sensors.velocity_filter == 0.1
+
+
+@pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
+def test_an_unknown_keyword_is_named_with_all_that_are_valid(make: type[MaraEnv]) -> None:
+    with pytest.raises(
+        GymMaraError, match=r"'widht' with backend 'pinocchio'\. Did you mean 'width'"
+    ) as error:
+        make(widht=3)
+    for name in ("alpha", "camera", "collision", "velocity_filter"):
+        assert name in str(error.value)
+
+
+@dataclass(frozen=True)
+class Ambiguous(ReachTask):
+    """A task with a value that rendering has, too."""
+
+    width: float = 1.0
+
+
+def test_a_keyword_of_two_rooms_is_refused() -> None:
+    with pytest.raises(GymMaraError, match="'width' belongs to the task and the rendering"):
+        MaraEnv(Ambiguous(), width=2.0)
+    MaraEnv(Ambiguous()).close()
