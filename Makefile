@@ -1,15 +1,15 @@
-# make demo and make test are all that a newcomer needs; each sets up what it needs, once.
+# A newcomer needs only `make demo` and `make test`. The first one that is run sets up the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 READY = $(VENV)/.ready
-# What is imported is compiled then, and kept; most of what is installed never is.
+# Python compiles a module when it is first imported; compiling all modules at installation would take longer.
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: demo test lint bench experiment test-oldest test-rllib test-wheel clean
 
-demo: $(READY) ## Train PPO on MARA-v0, evaluate it, leave a run folder under runs/.
+demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
 
 test: $(READY) ## Run the tests, some of them in Chromium.
@@ -21,7 +21,7 @@ lint: $(READY) ## Check format, lint and types.
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: ## Measure speed against the floor and against peers, which pin an older MuJoCo, in an environment of its own.
+bench: ## Measure speed. The other packages that it compares with pin an older MuJoCo, hence a separate virtual environment.
 	$(MAKE) .venv-bench/.ready VENV=.venv-bench EXTRAS=bench
 	.venv-bench/bin/python benchmarks/speed.py
 	.venv-bench/bin/python benchmarks/dynamics.py
@@ -30,17 +30,17 @@ bench: ## Measure speed against the floor and against peers, which pin an older 
 experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
 	$(BIN)/gym-mara benchmark --out runs/experiment
 
-test-oldest: ## Run the tests of all that Gymnasium calls, with the oldest that is supported.
+test-oldest: ## Run the tests of environments, pictures and commands with the oldest supported Gymnasium.
 	$(MAKE) test VENV=.venv-oldest EXTRAS=test CONSTRAINTS=constraints-oldest.txt TESTS="$(GYMNASIUM_TESTS)"
 
-test-rllib: ## Run the example of RLlib, which pins an older Gymnasium, in an environment of its own.
+test-rllib: ## Run the RLlib example, which pins an older Gymnasium, in a separate virtual environment.
 	$(MAKE) .venv-rllib/.ready VENV=.venv-rllib EXTRAS=rllib
 	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
 
-test-wheel: ## Build the wheel, install it away from the checkout, and use every environment from there.
+test-wheel: ## Build the wheel, install it outside the checkout, and use every environment there.
 	.ci/test-wheel $(PYTHON)
 
-clean: ## Remove the virtual environments and what the tools left.
+clean: ## Remove the virtual environments and the files of the tools.
 	rm -rf .venv .venv-bench .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt

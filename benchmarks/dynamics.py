@@ -1,4 +1,4 @@
-"""What the dynamic backend costs, beside the physics it contains and beside peers, and how well it keeps energy; prints Markdown."""
+"""Speed of the dynamic backend, compared with DART alone and with other packages, and its energy drift; prints Markdown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENV_ID = "gym_mara/MARACollisionOrient-v0"
 
 
 def bare_steps(actions: Any) -> Callable[[], int]:
-    """DART's own world.step() over the arm's way in `dynamic`: the same states, commands and number of calls."""
+    """DART's world.step() alone, with the same states, commands and number of calls as in `dynamic`."""
     env = gymnasium.make(ENV_ID, backend="dart")
     backend = env.unwrapped.simulation.backend  # type: ignore[attr-defined]
     assert isinstance(backend, DartBackend)
@@ -56,21 +56,21 @@ def dynamic(env_id: str = ENV_ID, **options: Any) -> Callable[[], int]:
 
 
 def print_step() -> None:
-    """One environment beside the bare physics that its steps contain."""
+    """Compare one environment with the physics steps that it contains."""
     env = gymnasium.make(ENV_ID, backend="dart")
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(200)]
     measured = rates({"bare": bare_steps(actions), "env": dynamic()})
-    print("\n## One dynamic environment, beside the world.step() calls it contains\n")
-    row("what", "steps per second", "time, relative")
+    print("\n## One dynamic environment, compared with its world.step() calls\n")
+    row("", "steps per second", "relative time")
     row("---", "---", "---")
-    row("bare world.step(), 20 a step", f"{measured['bare']:,.0f}", "1.00")
+    row("world.step() alone, 20 calls per step", f"{measured['bare']:,.0f}", "1.00")
     ratio = measured["bare"] / measured["env"]
     row(f"{ENV_ID}, backend='dart'", f"{measured['env']:,.0f}", f"{ratio:.2f}")
 
 
 def print_workers() -> None:
-    """The same arms in one process and in two."""
+    """Compare the same arms in one process and in two."""
     functions = {
         str(workers): batch(ENV_ID, 64, backend="dart", workers=workers) for workers in (1, 2)
     }
@@ -83,7 +83,7 @@ def print_workers() -> None:
 
 
 def print_peers() -> None:
-    """One dynamic environment beside the peers that are installed."""
+    """Compare one dynamic environment with the other packages that are installed."""
     functions = {f"{ENV_ID}, backend='dart'": dynamic()}
     for module, env_id in PEERS.items():
         try:
@@ -95,7 +95,7 @@ def print_peers() -> None:
             print(f"\n{env_id} cannot run here: {type(error).__name__} {error}")
     measured = rates(functions)
     ours = next(iter(measured.values()))
-    print("\n## One dynamic environment beside its peers\n")
+    print("\n## One dynamic environment, compared with other packages\n")
     row("environment", "steps per second", "ours is faster by")
     row("---", "---", "---")
     for name, rate in measured.items():
@@ -103,13 +103,13 @@ def print_peers() -> None:
 
 
 def _resident() -> float:
-    """The memory that this process holds, MB."""
+    """The memory of this process, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 
 
 def print_memory() -> None:
-    """What an environment more takes."""
+    """Print the memory of an additional environment."""
     if not Path("/proc/self/statm").is_file():
         print("\nMemory is measured on Linux only.")
         return
@@ -124,20 +124,20 @@ def print_memory() -> None:
 
 
 def print_energy() -> None:
-    """How the energy of a limp arm drifts over 10 s, in free space."""
-    print("\n## Energy drift of a limp arm over 10 s, without contact or friction\n")
+    """Print the energy drift of an arm without motors over 10 s, in free space."""
+    print("\n## Energy drift of an arm without motors over 10 s, without contact or friction\n")
     row(
         "start",
         "physics step, ms",
         "largest kinetic energy, J",
         "largest drift, J",
-        "within the first second, J",
+        "largest drift in the first second, J",
     )
     row(*["---"] * 5)
     robot = RobotModel.load("mara")
     starts = {
-        "hanging, nearly": (0.3, 2.6, 0.3, 0.2, 0.3, 0.0),
-        "upright, nearly": (0.5, 1.0, 0.5, 0.3, -0.5, 0.0),
+        "nearly hanging": (0.3, 2.6, 0.3, 0.2, 0.3, 0.0),
+        "nearly upright": (0.5, 1.0, 0.5, 0.3, -0.5, 0.0),
     }
     for name, start in starts.items():
         for step in (1e-3, 1e-4):
@@ -156,7 +156,7 @@ def print_energy() -> None:
 
 
 def energies(arm: DartArm, seconds: float) -> tuple[Any, Any]:
-    """The kinetic and the total energy of an arm that moves by itself, at each physics step, J."""
+    """The kinetic and the total energy of an arm without motors, at each physics step, J."""
     kinetic, potential = [], []
     for _ in range(round(seconds / arm.physics_step)):
         arm.world.step()

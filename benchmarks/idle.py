@@ -1,6 +1,7 @@
-"""Environments that do nothing: the spaces of MARA-v0, zeros, episodes of 2048 steps. A loop on them is the library's own.
+"""Environments that do nothing: the spaces of MARA-v0, observations of zeros, episodes of 2048 steps.
 
-Importing it registers `idle/MARA-v0`; the prefix `idle:` lets other processes find it too.
+A training loop on them shows the cost of the library alone. Importing this module registers `idle/MARA-v0`; with the
+prefix `idle:` other processes import it too.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class IdleEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
 
 class IdleVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
-    """Many of them."""
+    """Many arms that do not move."""
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ EPISODE = 2048
 
 
 class IdleVecEnv(VecEnv):
-    """Arms that do not move, with the spaces of others."""
+    """Arms that do not move, with the spaces of another VecEnv."""
 
     def __init__(self, like: VecEnv) -> None:
         super().__init__(like.num_envs, like.observation_space, like.action_space)

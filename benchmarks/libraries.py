@@ -1,7 +1,7 @@
-"""What gym_mara costs through each library: its own training loop on MARA-v0, beside the same on an environment that does nothing.
+"""Cost of gym_mara in each library: its training loop on MARA-v0, compared with the same loop on an environment that does nothing.
 
-Both are trained in turn, some rounds; the shortest time of each counts. RLlib is measured where it is installed, and nothing
-else then: it pins a Gymnasium of its own.
+Both are trained in turn for some rounds, and the shortest time of each counts. If RLlib is installed, only RLlib is measured,
+because it pins its own version of Gymnasium.
 
     python benchmarks/libraries.py [NAME ...]
 """
@@ -32,7 +32,7 @@ Job = Callable[[], object]
 
 
 def through_example(script: str, steps: int, way: str = "make") -> Callable[[str], Job]:
-    """Trains as an example does."""
+    """Train as an example does."""
 
     def of(env_id: str) -> Job:
         module = importlib.import_module(script)
@@ -42,7 +42,7 @@ def through_example(script: str, steps: int, way: str = "make") -> Callable[[str
 
 
 def through_batch(script: str, steps: int, way: str = "make") -> Callable[[str], Job]:
-    """Trains as an example does whose arms are a VecEnv of ours."""
+    """Train as an example with our VecEnv does."""
 
     def of(env_id: str) -> Job:
         from idle_vec_env import IdleVecEnv
@@ -55,7 +55,7 @@ def through_batch(script: str, steps: int, way: str = "make") -> Callable[[str],
 
 
 def through_zoo(algo: str, steps: int) -> Callable[[str], Job]:
-    """Trains as RL Baselines3 Zoo does, with the configuration of examples/rl_zoo3."""
+    """Train as RL Baselines3 Zoo does, with the configuration in examples/rl_zoo3."""
 
     def of(env_id: str) -> Job:
         zoo = importlib.import_module("zoo")
@@ -77,7 +77,7 @@ def through_zoo(algo: str, steps: int) -> Callable[[str], Job]:
 
 
 def through_rllib(steps: int) -> Callable[[str], Job]:
-    """Trains as examples/rllib_ppo.py does, two remote env runners."""
+    """Train as examples/rllib_ppo.py does, with two remote env runners."""
 
     def of(env_id: str) -> Job:
         module = importlib.import_module("rllib_ppo")
@@ -109,7 +109,7 @@ RLLIB = {"RLlib": ("ray", through_rllib(100_000))}
 
 
 def seconds(job: Job) -> float:
-    """How long a job takes, s; what it prints is not shown."""
+    """The duration of a job, s; its output is not shown."""
     with contextlib.redirect_stdout(io.StringIO()):
         start = time.perf_counter()
         job()
@@ -129,7 +129,7 @@ def main() -> None:
         if find_spec("ray.rllib") and find_spec("tree") and not find_spec("skrl")
         else LIBRARIES
     )
-    print("| library | version | s on MARA-v0 | s on one that does nothing | ratio |")
+    print("| library | version | MARA-v0, s | does nothing, s | ratio |")
     print("|---|---|---|---|---|")
     for name in sys.argv[1:] or known:
         package, of = known[name]
@@ -137,7 +137,7 @@ def main() -> None:
         for number in range(ROUNDS + 1):
             for env_id in best:
                 spent = seconds(of(env_id))
-                if number:  # the first only warms up
+                if number:  # the first round only warms up
                     best[env_id] = min(best[env_id], spent)
         ratio = best[OURS] / best[IDLE]
         cells = name, version(package), f"{best[OURS]:.2f}", f"{best[IDLE]:.2f}", f"{ratio:.2f}"

@@ -1,4 +1,4 @@
-"""How long a picture takes, with each renderer, and what an environment costs that could draw and does not."""
+"""Time of a picture with each renderer, and the cost of a render mode in steps without a picture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TARGETS = {"vtk": 60.0, "raycast": 200.0}
 
 
 def picture_ms(renderer: str, robot: str) -> float:
-    """The median time of a picture of 640 × 480 pixels, ms, each of another pose."""
+    """The median time of a picture of 640 × 480 pixels, each of a different pose, ms."""
     env = MaraEnv(render_mode="rgb_array", renderer=renderer, robot=robot)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -32,7 +32,7 @@ def picture_ms(renderer: str, robot: str) -> float:
 
 
 def seconds(env: MaraEnv) -> float:
-    """How long STEPS steps take without a picture, s."""
+    """The duration of STEPS steps without a picture, s."""
     action = np.zeros(6, np.float32)
     begin = time.perf_counter()
     for _ in range(STEPS):
@@ -41,7 +41,7 @@ def seconds(env: MaraEnv) -> float:
 
 
 def cost_of_not_rendering() -> float:
-    """How much longer steps take in an environment that could draw: the median ratio, the two by turns."""
+    """The time of a step with a render mode, relative to a step without one: the median ratio, measured in turn."""
     without, with_mode = MaraEnv(), MaraEnv(render_mode="rgb_array")
     for env in (without, with_mode):
         env.reset(seed=0)
@@ -51,14 +51,16 @@ def cost_of_not_rendering() -> float:
 
 def main() -> None:
     """Print both tables."""
-    print("| 640 × 480 | MARA, ms | UR5, ms | aim for MARA |")
+    print("| 640 × 480 | MARA, ms | UR5, ms | goal for MARA, ms |")
     print("|---|---|---|---|")
     for renderer in RENDERERS:
         mara, ur5 = picture_ms(renderer, "mara"), picture_ms(renderer, "ur5")
         print(f"| `{renderer}` | {mara:.0f} | {ur5:.0f} | {TARGETS[renderer]:.0f} |")
     print()
     ratio = cost_of_not_rendering()
-    print(f"Steps of an environment that could draw, over one that could not: {ratio:.3f} times.")
+    print(
+        f'With render_mode="rgb_array", a step without a picture takes {ratio:.3f} times as long.'
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Environment steps per second, against the floor and against peers, all in one run; prints Markdown.
+"""Environment steps per second, compared with Pinocchio alone and with other packages; prints Markdown.
 
-The floor is what any environment on Pinocchio must spend: forward kinematics alone, and with Coal's batched collision
-check, over the very configurations that the environment visits. Every figure is the best of several repetitions, and
-what is compared is measured in turn: on a shared machine only ratios within one run mean anything.
+The floor is the work that any environment on Pinocchio must do: forward kinematics, without and with Coal's batched
+collision check, for the same configurations that the environment visits. Every figure is the best of several repetitions.
+Figures that are compared are measured in turn, because on a shared machine only ratios within one run are meaningful.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SECONDS = 0.2
 
 
 def rates(functions: dict[str, Callable[[], int]]) -> dict[str, float]:
-    """Steps per second of each function, which returns how many it made; the best of several turns."""
+    """Steps per second of each function, the best of several turns; a function returns its number of steps."""
     best = dict.fromkeys(functions, 0.0)
     for function in functions.values():
         function()  # warm up
@@ -48,7 +48,7 @@ def rates(functions: dict[str, Callable[[], int]]) -> dict[str, float]:
 
 
 def single(env_id: str, **options: Any) -> Callable[[], int]:
-    """Steps of one environment with random actions, through gymnasium.make."""
+    """Steps of one environment with random actions, made by gymnasium.make."""
     env = gymnasium.make(env_id, **options)
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -67,7 +67,7 @@ def single(env_id: str, **options: Any) -> Callable[[], int]:
 def batch(
     env_id: str, num_envs: int, by_samples: bool = False, **options: Any
 ) -> Callable[[], int]:
-    """Steps of the native vector environment with random actions; with paths checked by their samples alone."""
+    """Steps of the native vector environment with random actions; `by_samples` checks every path by samples."""
     envs: Any = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
     if by_samples:
         envs.unwrapped.simulation.backend._with_room = None
@@ -93,7 +93,7 @@ def configurations(num_envs: int) -> NDArray[np.float64]:
 
 
 def kinematics_floor(q: NDArray[np.float64]) -> Callable[[], int]:
-    """Pinocchio's forward kinematics, one configuration a call: it has no other."""
+    """Pinocchio's forward kinematics, which has only calls for one configuration."""
     robot = RobotModel.load("mara")
     model, data, frame = robot.model, robot.model.createData(), robot.ee_frame_id
 
@@ -107,7 +107,7 @@ def kinematics_floor(q: NDArray[np.float64]) -> Callable[[], int]:
 
 
 def collision_floor(q: NDArray[np.float64]) -> Callable[[], int]:
-    """The forward kinematics above, and Coal's batched check on all cores."""
+    """The forward kinematics above, with Coal's batched check on all cores."""
     robot = RobotModel.load("mara")
     threads = len(os.sched_getaffinity(0))
     pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
@@ -129,7 +129,7 @@ def row(*cells: object) -> None:
 
 
 def print_throughput() -> None:
-    """Every environment at every size beside the floors."""
+    """Compare every environment, with every number of arms, with the floors."""
     print("\n## Steps per second, random actions\n")
     row(
         "environments",
@@ -159,24 +159,26 @@ def print_throughput() -> None:
 
 
 def print_travelling() -> None:
-    """Arms that travel beside arms that teleport, and what looking for room around a path is worth."""
+    """Compare arms with a limited joint speed with teleporting arms, and measure the gain of checking a path once."""
     travelling: dict[str, Any] = {"max_joint_velocity": 1.57}
     measured = rates(
         {
             "teleporting": batch("gym_mara/MARA-v0", 64),
-            "travelling at 1.57 rad/s": batch("gym_mara/MARA-v0", 64, **travelling),
-            "the same, by samples alone": batch("gym_mara/MARA-v0", 64, True, **travelling),
+            "limited to 1.57 rad/s": batch("gym_mara/MARA-v0", 64, **travelling),
+            "the same, every path checked by samples": batch(
+                "gym_mara/MARA-v0", 64, True, **travelling
+            ),
         }
     )
-    print("\n## 64 arms that travel\n")
-    row("joints", "steps per second", "of teleporting")
+    print("\n## 64 arms with a limited joint speed\n")
+    row("joints", "steps per second", "relative to teleporting")
     row("---", "---", "---")
     for name, rate in measured.items():
         row(name, f"{rate:,.0f}", f"{rate / measured['teleporting']:.2f}")
 
 
 def print_peers() -> None:
-    """One environment through gymnasium.make, beside the peers that are installed."""
+    """Compare one environment, made by gymnasium.make, with the other packages that are installed."""
     functions = {}
     for module, env_id in PEERS.items():
         try:
@@ -198,7 +200,7 @@ def print_peers() -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--no-training", action="store_true", help="leave out the training")
+    parser.add_argument("--no-training", action="store_true", help="do not measure the training")
     arguments = parser.parse_args()
     libraries = ", ".join(f"{name} {version(name)}" for name in ("gymnasium", "numpy", "pin"))
     print(

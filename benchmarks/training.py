@@ -1,4 +1,4 @@
-"""What training costs beside an environment that does nothing, and what one update of each algorithm costs."""
+"""Time of a training, compared with an environment that does nothing, and time of one update of each algorithm."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SLICES = 5
 
 
 def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
-    """Train both for 1M steps with PPO's preset of this name, slice by slice in turn, and say how the times compare."""
+    """Train PPO for 1M steps on both, slice by slice in turn, with the preset of this name; compare the times."""
     preset = algorithm("ppo").preset(name, teleports=True)
     ours = make_env(task, "pinocchio", preset.num_envs, {})
     models = [new_agent("ppo", preset, env, seed=0) for env in (ours, IdleVecEnv(ours))]
@@ -26,7 +26,7 @@ def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
         for index, model in enumerate(models):
             seconds[index] += _learn(model, STEPS // SLICES)
     return (
-        f"{task}, preset {name}, {STEPS:,} steps: {seconds[0]:.1f} s; doing nothing: {seconds[1]:.1f} s; "
+        f"- {task}, preset {name}, {STEPS:,} steps: {seconds[0]:.1f} s; doing nothing: {seconds[1]:.1f} s; "
         f"ratio {seconds[0] / seconds[1]:.2f}"
     )
 
@@ -38,7 +38,7 @@ def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
 
 
 def update_costs(batch: int = 2048) -> dict[str, float]:
-    """How long each algorithm's update takes on a batch of the same size, ms: the shortest of several turns."""
+    """The time of an update of each algorithm on a batch of the same size, ms: the shortest of several turns."""
     models = {}
     for algo in ALGORITHMS:
         preset = algorithm(algo).preset("tuned", teleports=True)
@@ -58,12 +58,12 @@ def update_costs(batch: int = 2048) -> dict[str, float]:
 
 def print_training() -> None:
     """Measure and print."""
-    print("\n## Training, against the same PPO on an environment that does nothing\n")
+    print("\n## Training with PPO, compared with an environment that does nothing\n")
     for name in ("tuned", "paper"):
         print(training_ratio(name))
     print("\n## One update on the same batch of 2048 steps, tuned presets\n")
     costs = update_costs()
-    print("| algorithm | ms | of PPO's |")
+    print("| algorithm | ms | relative to PPO |")
     print("|---|---|---|")
     for algo, cost in costs.items():
         print(f"| {algo} | {cost:.1f} | {cost / costs['ppo']:.2f} |")

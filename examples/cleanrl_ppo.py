@@ -1,6 +1,6 @@
-"""PPO in one file, in the style of CleanRL's, on Gymnasium 1.x.
+"""PPO in one file, in the style of CleanRL, on Gymnasium 1.x.
 
-CleanRL's own scripts make an id and pass no keyword arguments: an id of one's own carries them, as the one registered here.
+CleanRL's own scripts pass no keyword arguments to the environment. Register an id that contains them, as here.
 
     python examples/cleanrl_ppo.py --steps 100000
 """
@@ -26,7 +26,7 @@ gymnasium.register(
     kwargs={"task": "MARA-v0", "max_joint_velocity": 1.57},
     max_episode_steps=256,
 )
-# CleanRL's own numbers, its 2048 steps of one environment spread over many arms; but for gamma, there 0.99.
+# CleanRL's own values, except gamma, which is 0.99 there; its 2048 steps of one environment are split over many arms.
 ARMS, ROLLOUT, EPOCHS, BATCH = 64, 32, 10, 64
 GAMMA, LAMBDA, CLIP = 0.95, 0.95, 0.2
 
@@ -55,7 +55,7 @@ def make(env_id: str = "MARA-travelling-v0") -> VectorEnv[Any, Any, Any]:
 
 
 def train(envs: VectorEnv[Any, Any, Any], steps: int) -> float:
-    """Train for so many steps over all arms, and return what a step of the last rollout earned."""
+    """Train for this many steps over all arms; return the mean reward per step of the last rollout."""
     torch.manual_seed(0)
     agent = Agent(flatdim(envs.single_observation_space), flatdim(envs.single_action_space))
     optimizer = torch.optim.Adam(agent.parameters(), lr=3e-4)
@@ -86,7 +86,7 @@ def train(envs: VectorEnv[Any, Any, Any], steps: int) -> float:
                 delta = rewards[t] + GAMMA * after * (1.0 - ends[t]) - values[t]
                 carried = delta + GAMMA * LAMBDA * (1.0 - ends[t]) * carried
                 advantages[t], after = carried, values[t]
-        # Gymnasium's vector environments begin an episode in the step after its end: such steps teach nothing.
+        # Gymnasium's vector environments reset in the step after an episode ends: exclude that step from learning.
         real = begins.flatten() == 0.0
         flat = [
             x.flatten(0, 1)[real] for x in (observations, actions, log_probs, advantages, values)
@@ -108,7 +108,7 @@ def train(envs: VectorEnv[Any, Any, Any], steps: int) -> float:
 
 
 def main() -> None:
-    """Train, and say what a step earns."""
+    """Train, and print the reward per step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env-id", default="MARA-travelling-v0")
     parser.add_argument("--steps", type=int, default=100_000, help="over all arms")

@@ -17,13 +17,13 @@ import gym_mara  # noqa: F401 - registers the environments
 
 
 def make() -> gymnasium.Env:  # type: ignore[type-arg]
-    """A new target in each episode of 50 steps; 0 within 5 cm of it, else -1."""
+    """Make the environment: a new target in each episode of 50 steps; reward 0 within 5 cm of it, else -1."""
     env = gymnasium.make("gym_mara/MARAGoal-v0", position_tolerance=0.05)
     return RescaleAction(env, np.float32(-1), np.float32(1))
 
 
 def main() -> None:
-    """Train, and say what the deterministic policy earns: -50 an episode that never gets there."""
+    """Train, and print the return of the deterministic policy: -50 for an episode that never reaches its target."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=20_000)
     steps = parser.parse_args().steps

@@ -1,4 +1,4 @@
-"""PPO of RLlib, its new API stack, with the native vector environment in remote env runners.
+"""PPO of RLlib (new API stack) with the native vector environment in remote env runners.
 
 python examples/rllib_ppo.py --steps 200000
 """
@@ -20,24 +20,24 @@ with needs("this example", "rllib"):
     from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 ID = "gym_mara:gym_mara/MARA-v0"
-"""With the module in front, so that the env runners, processes of their own, find it too."""
+"""With the module as prefix, so that the processes of the env runners import it too."""
 ARMS = 32
 BATCH = 2048
 PATIENCE = 60
-"""Iterations; some seconds long where every env runner is gone."""
+"""Number of iterations without a step before the training stops; each lasts some seconds if every env runner has died."""
 
 
 def config(env_id: str = ID, env_runners: int = 2) -> PPOConfig:
-    """PPO on `env_id`, with ARMS arms in each env runner; env_config takes the environment's keyword arguments."""
+    """Configure PPO on `env_id` with ARMS arms in each env runner; env_config takes keyword arguments of the environment."""
 
-    # A function within a function, so that Ray sends its code: the env runners need not find this file.
+    # A nested function, so that Ray sends its code: the env runners do not need to import this file.
     def log_reward(*, samples: list[Any], metrics_logger: Any, **_: Any) -> None:
         rewards = np.concatenate([episode.get_rewards() for episode in samples])
         metrics_logger.log_value("reward_per_step", rewards.mean(), window=1)
 
     return (
         PPOConfig()
-        # In rad: scaled to the whole turns of the action space, RLlib's first policy would be π times as noisy.
+        # Actions in rad: normalised to the action space of ±π, RLlib's first policy would be π times as noisy.
         .environment(env_id, env_config={}, normalize_actions=False, clip_actions=True)
         .env_runners(
             num_env_runners=env_runners,
@@ -62,8 +62,8 @@ def config(env_id: str = ID, env_runners: int = 2) -> PPOConfig:
 
 
 def train(config: PPOConfig, steps: int) -> float:
-    """Train for at least `steps` steps over all arms; what a step of the last batch earned."""
-    # What is wrong with an environment RLlib hides under an IndexError of its own: make it here first.
+    """Train for at least `steps` steps over all arms; return the mean reward per step of the last batch."""
+    # RLlib hides an error of the environment behind its own IndexError: make the environment here first.
     gymnasium.make_vec(
         config.env, vectorization_mode=config.gym_env_vectorize_mode, **config.env_config
     ).close()
@@ -74,7 +74,7 @@ def train(config: PPOConfig, steps: int) -> float:
             result = algorithm.train()["env_runners"]
             before, sampled = sampled, result["num_env_steps_sampled_lifetime"]
             reward = result["reward_per_step"]
-            # Env runners that died are begun anew; RLlib would wait for ever for ones that cannot.
+            # RLlib restarts env runners that died, and waits forever if they cannot start.
             without = without + 1 if sampled == before else 0
             if without == PATIENCE:
                 raise RuntimeError(
@@ -86,14 +86,14 @@ def train(config: PPOConfig, steps: int) -> float:
 
 
 def main() -> None:
-    """Train, and say what a step earns."""
+    """Train, and print the reward per step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env-id", default=ID)
     parser.add_argument("--env-runners", type=int, default=2)
     parser.add_argument("--steps", type=int, default=200_000, help="over all arms")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # the learner's: the other cores are the env runners'
-    # A Ray of its own, on this machine; an env runner that finds no free CPU would wait for ever.
+    torch.set_num_threads(1)  # for the learner; the env runners use the other cores
+    # A new Ray instance on this machine, with enough CPUs: an env runner without a free CPU would wait forever.
     with ray.init("local", num_cpus=max(2, arguments.env_runners), include_dashboard=False):
         reward = train(config(arguments.env_id, arguments.env_runners), arguments.steps)
     print(f"reward per step: {reward:.3f}")

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's own PPO on gym_mara, four ways.
+"""Stable-Baselines3's PPO on gym_mara, with four kinds of environments.
 
 python examples/sb3_ppo.py --way native --steps 100000
 """
@@ -21,31 +21,31 @@ from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.envs import MaraVectorEnv
 
 ID = "gym_mara:gym_mara/MARA-v0"
-"""With the module in front, so that processes of their own find it too."""
+"""With the module as prefix, so that worker processes import it too."""
 
 
 def rescaled(env: gymnasium.Env) -> gymnasium.Env:  # type: ignore[type-arg]
-    """Actions in [-1, 1], as Stable-Baselines3 recommends."""
+    """Rescale the actions to [-1, 1], as Stable-Baselines3 recommends."""
     return RescaleAction(env, np.float32(-1), np.float32(1))
 
 
 def single(env_id: str = ID) -> gymnasium.Env:  # type: ignore[type-arg]
-    """One environment."""
+    """Make one environment."""
     return rescaled(gymnasium.make(env_id))
 
 
 def in_turn(env_id: str = ID) -> VecEnv:
-    """Several, one after the other."""
+    """Make several environments, stepped one after the other."""
     return make_vec_env(env_id, n_envs=4, wrapper_class=rescaled)
 
 
 def in_processes(env_id: str = ID) -> VecEnv:
-    """Several, each in a process of its own."""
+    """Make several environments, each in its own process."""
     return make_vec_env(env_id, n_envs=2, wrapper_class=rescaled, vec_env_cls=SubprocVecEnv)
 
 
 def native() -> VecEnv:
-    """256 arms in one batch: by far the fastest."""
+    """Make 256 arms in one batch: by far the fastest."""
     return MaraVecEnv(MaraVectorEnv(256, "MARA-v0", autoreset_mode="SameStep"))
 
 
@@ -58,7 +58,7 @@ WAYS: dict[str, Callable[..., Any]] = {
 
 
 def train(env: Any, steps: int) -> PPO:
-    """Train for so many steps over all arms: with the library's own settings, but for hundreds of arms larger batches."""
+    """Train for this many steps over all arms, with the library's defaults, but larger batches for hundreds of arms."""
     arms = getattr(env, "num_envs", 1)
     rollout, batch = 2048 // arms, 256 if arms > 8 else 64
     model = PPO("MlpPolicy", env, n_steps=rollout, batch_size=batch, device="cpu", seed=0)
@@ -66,7 +66,7 @@ def train(env: Any, steps: int) -> PPO:
 
 
 def main() -> None:
-    """Train, and say how far the deterministic policy ends from the target."""
+    """Train, and print the final position error of the deterministic policy."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--way", choices=WAYS, default="native")
     parser.add_argument("--steps", type=int, default=100_000)

@@ -1,4 +1,4 @@
-"""PPO of sbx, Stable-Baselines3 on JAX, on hundreds of arms in one batch.
+"""PPO of sbx (Stable-Baselines3 on JAX) with hundreds of arms in one batch.
 
 python examples/sbx_ppo.py --steps 100000
 """
@@ -25,13 +25,13 @@ ROLLOUT = 2
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> VecEnv:
-    """The arms; their actions are rescaled to [-1, 1], and observations in float64 become float32 in JAX."""
+    """Make the arms. Their actions are rescaled to [-1, 1]; JAX converts float64 observations to float32."""
     arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
     return MaraVecEnv(cast(MaraVectorEnv, arms))
 
 
 def train(env: VecEnv, steps: int) -> Any:
-    """Train for so many steps over all arms, and return the model."""
+    """Train for this many steps over all arms, and return the model."""
     model = PPO(
         "MlpPolicy",
         env,
@@ -40,14 +40,14 @@ def train(env: VecEnv, steps: int) -> Any:
         n_epochs=5,
         gamma=0.9,
         learning_rate=lambda remaining: 3e-3 * remaining,
-        policy_kwargs={"log_std_init": -2.0, "ortho_init": True},  # sbx has no ortho_init by itself
+        policy_kwargs={"log_std_init": -2.0, "ortho_init": True},  # off by default in sbx
         seed=0,
     )
     return model.learn(steps)
 
 
 def main() -> None:
-    """Train, and say how far the deterministic policy ends from the target."""
+    """Train, and print the final position error of the deterministic policy."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
     steps = parser.parse_args().steps

@@ -1,4 +1,4 @@
-"""PPO of skrl on the native vector environment, which resets in the same step, as skrl wants it.
+"""PPO of skrl on the native vector environment, with the autoreset mode that skrl needs.
 
 python examples/skrl_ppo.py --steps 50000
 """
@@ -27,13 +27,13 @@ SETTLING = 20
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> Any:
-    """The arms, as skrl takes them."""
+    """Make the arms, wrapped for skrl."""
     arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
     return wrap_env(arms, wrapper="gymnasium")
 
 
 def train(env: Any, steps: int) -> PPO:
-    """Train for so many steps over all arms."""
+    """Train for this many steps over all arms."""
     torch.manual_seed(0)
     network = [{"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}]
     spaces = {
@@ -58,13 +58,13 @@ def train(env: Any, steps: int) -> PPO:
 
 
 def main() -> None:
-    """Train, and say what the mean action earns in a step once the arms have settled."""
+    """Train, and print the reward per step of the mean action once the arms have settled."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
     env = make()
     agent = train(env, parser.parse_args().steps)
     observation, _ = env.reset()
-    # The policy has hardly seen the start pose, where an episode of 2048 steps is but once.
+    # An episode of 2048 steps is at the start pose only once, so the policy has hardly been trained there.
     for _ in range(SETTLING):
         with torch.no_grad():
             seen = {"observations": observation.float()}

@@ -1,7 +1,7 @@
 """PPO of Tianshou 2 on the native vector environment, through a small adapter.
 
-Tianshou steps vector environments of its own, and resets by itself those whose episodes have ended: with
-autoreset_mode="Disabled" ours does just what it wants.
+Tianshou has its own class of vector environments, and resets ended episodes itself. It therefore needs
+autoreset_mode="Disabled".
 
     python examples/tianshou_ppo.py --steps 100000
 """
@@ -38,21 +38,21 @@ SETTLING = 20
 
 
 class NativeVectorEnv(BaseVectorEnv):  # type: ignore[misc]
-    """A Gymnasium vector environment that resets nothing by itself, as Tianshou's collector wants it.
+    """Adapts a Gymnasium vector environment without autoreset to Tianshou's collector.
 
-    Steps are always of all arms: collect steps (`n_step`), not episodes. What the environment says in `info` is left out.
+    A step always moves all arms: collect steps (`n_step`), not episodes. The `info` of the environment is dropped.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
-        # Not the base's: it would make one Python worker per arm.
+        # Do not call the base class: it would make one Python worker per arm.
         self.env, self.env_num, self.is_async, self.is_closed = env, env.num_envs, False, False
 
     def get_env_attr(self, key: str, id: Any = None) -> list[Any]:  # noqa: A002 - Tianshou's name
-        """What every arm has: single_action_space for action_space, and so on."""
+        """Return an attribute of one arm for every arm: single_action_space for action_space, and so on."""
         return [getattr(self.env, f"single_{key}")] * self.env_num
 
     def reset(self, env_id: Any = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
-        """Begin episodes, of all arms or of some."""
+        """Reset all arms or some of them."""
         arms = np.arange(self.env_num)[slice(None) if env_id is None else env_id]
         mask = np.isin(np.arange(self.env_num), arms)
         observation, _ = self.env.reset(options={"reset_mask": mask}, **kwargs)
@@ -70,17 +70,17 @@ class NativeVectorEnv(BaseVectorEnv):  # type: ignore[misc]
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> NativeVectorEnv:
-    """The arms in one batch."""
+    """Make the arms in one batch."""
     return NativeVectorEnv(gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="Disabled"))
 
 
 def gaussian(loc_scale: tuple[torch.Tensor, torch.Tensor]) -> Distribution:
-    """The distribution of the actions, [-1, 1] of each joint's range."""
+    """Make the distribution of the actions, where [-1, 1] is the range of each joint."""
     return Independent(Normal(*loc_scale), 1)
 
 
 def train(env: NativeVectorEnv, steps: int) -> ProbabilisticActorPolicy:
-    """Train for so many steps over all arms, and return the policy."""
+    """Train for this many steps over all arms, and return the policy."""
     torch.manual_seed(0)
     observations, actions = (
         env.get_env_attr("observation_space")[0],
@@ -106,7 +106,7 @@ def train(env: NativeVectorEnv, steps: int) -> ProbabilisticActorPolicy:
         policy=policy,
         critic=ContinuousCritic(preprocess_net=Net(**network)),
         optim=adam,
-        gamma=0.0,  # what comes next hangs on the action alone
+        gamma=0.0,  # the next state depends only on the action
         ent_coef=0.0,
         max_grad_norm=0.5,
     )
@@ -126,14 +126,14 @@ def train(env: NativeVectorEnv, steps: int) -> ProbabilisticActorPolicy:
 
 
 def main() -> None:
-    """Train, and say what the mean action earns in a step once the arms have settled."""
+    """Train, and print the reward per step of the mean action once the arms have settled."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=100_000, help="over all arms")
     steps = parser.parse_args().steps
     env = make()
     policy = train(env, steps)
     observation, _ = env.reset()
-    # The policy has hardly seen the start pose, where an episode of 2048 steps is but once.
+    # An episode of 2048 steps is at the start pose only once, so the policy has hardly been trained there.
     for _ in range(SETTLING):
         with torch.no_grad():
             action = policy.map_action(policy(Batch(obs=observation, info=Batch())).act)

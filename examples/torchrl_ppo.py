@@ -1,7 +1,7 @@
 """PPO of TorchRL on the native vector environment.
 
-TorchRL's GymWrapper takes vector environments whose autoreset_mode is "SameStep" or "Disabled". Its GymEnv keeps `backend`
-for itself and passes keyword arguments of its own on: make the environment with Gymnasium, and wrap it.
+TorchRL's GymWrapper accepts vector environments with the autoreset_mode "SameStep" or "Disabled". Its GymEnv does not work here:
+it uses the argument `backend` itself, and passes additional arguments to the environment.
 
     python examples/torchrl_ppo.py --steps 50000
 """
@@ -24,12 +24,12 @@ with needs("this example", "torchrl"):
     from torchrl.objectives import ClipPPOLoss
     from torchrl.objectives.value import GAE
 
-# As TorchRL's own PPO for MuJoCo 2048 frames and ten epochs, the frames spread over many arms and in larger batches.
+# 2048 frames and ten epochs, as in TorchRL's own PPO for MuJoCo, but split over many arms and in larger batches.
 ARMS, ROLLOUT, EPOCHS, BATCH = 64, 32, 10, 256
 
 
 def make(env_id: str = "gym_mara/MARA-v0") -> EnvBase:
-    """The arms, as TorchRL takes them."""
+    """Make the arms, wrapped for TorchRL."""
     arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
     return TransformedEnv(GymWrapper(arms), DoubleToFloat(in_keys=["observation"]))
 
@@ -40,7 +40,7 @@ def _network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def train(env: EnvBase, steps: int) -> float:
-    """Train for so many steps over all arms, and return what a step of the last rollout earned."""
+    """Train for this many steps over all arms; return the mean reward per step of the last rollout."""
     torch.manual_seed(0)
     inputs = env.observation_spec["observation"].shape[-1]
     outputs = env.action_spec.shape[-1]
@@ -76,7 +76,7 @@ def train(env: EnvBase, steps: int) -> float:
 
 
 def main() -> None:
-    """Train, and say what a step earns."""
+    """Train, and print the reward per step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=50_000, help="over all arms")
     env = make()

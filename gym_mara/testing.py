@@ -1,4 +1,4 @@
-"""For authors of backends: the contract as a suite of tests, which every backend here passes too.
+"""For authors of backends: the contract as a suite of tests, which every backend of this package passes too.
 
 from gym_mara.testing import BackendContract, Make
 
@@ -13,28 +13,32 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
 from gym_mara.backends import Backend
+from gym_mara.collision import make_checker
+from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.state import SimState
+from gym_mara.state import Contact, SimState
+from gym_mara.types import Floats, Mask
 
-Floats = NDArray[np.float64]
 Make = Callable[[int], Backend]
-"""Makes a backend for N arms of MARA."""
+"""Makes a backend for N arms of one robot, which must be able to collide."""
 
 COLLIDING_Q = (1.5, 2.0, 0.0, 0.0, 0.0, 0.0)
 """A configuration of MARA with its forearm in the table, and of FakeBackend beyond its wall."""
 
 
 def pickled(thing: Any) -> Any:
-    """What pickling and unpickling makes of it."""
+    """The object, pickled and unpickled."""
     return pickle.loads(pickle.dumps(thing))
 
 
@@ -42,16 +46,58 @@ COPIES = (pytest.param(copy.deepcopy, id="deepcopy"), pytest.param(pickled, id="
 """The two ways to duplicate an object."""
 
 
-def uniform_q(robot: RobotModel, count: int, seed: int) -> Floats:
-    """Configurations (N, J) all over what an action can ask for."""
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+def uniform_q(robot: RobotModel, count: int, seed: int, furthest: float = np.pi) -> Floats:
+    """Random configurations (N, J) within the joint limits, each joint at most `furthest`, rad, from zero."""
+    low, high = np.maximum(robot.lower, -furthest), np.minimum(robot.upper, furthest)
     return np.random.default_rng(seed).uniform(low, high, (count, robot.num_joints))
 
 
+@functools.cache
+def colliding_q(robot: RobotModel) -> tuple[float, ...]:
+    """A configuration (J,) with links deep inside each other: MARA's is known, others are searched at random.
+
+    Raises:
+        GymMaraError: no collision was found.
+    """
+    if robot.name == "mara":
+        return COLLIDING_Q
+    q = uniform_q(robot, 500, seed=0)
+    q = q[make_checker("coal", robot).check(q)]
+    if not len(q):
+        raise GymMaraError(f"no collision of {robot.name} was found; take a robot that can collide")
+    data, geometry_data = robot.model.createData(), robot.geometry.createData()
+
+    def distance(row: Floats) -> float:
+        pin.computeDistances(robot.model, data, robot.geometry, geometry_data, row)
+        return min(result.min_distance for result in geometry_data.distanceResults)
+
+    return tuple(min(q, key=distance).tolist())
+
+
 def arrays_of(state: SimState) -> dict[str, NDArray[Any]]:
-    """The arrays of a state by name."""
-    values = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    """The arrays of a state by name; those of its parameters as "parameters.NAME"."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for field in dataclasses.fields(state):
+        value = getattr(state, field.name)
+        if isinstance(value, np.ndarray):
+            arrays[field.name] = value
+        elif isinstance(value, Mapping):
+            arrays |= {f"{field.name}.{name}": array for name, array in value.items()}
+    return arrays
+
+
+def arms_of(state: SimState, arms: slice | Mask) -> SimState:
+    """The state of some of the arms."""
+
+    def chosen(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: array[arms] for name, array in value.items()}
+        if isinstance(value, tuple):
+            return tuple(value[index] for index in np.arange(len(value))[arms])
+        return None if value is None else value[arms]
+
+    fields = dataclasses.fields(state)
+    return SimState(**{field.name: chosen(getattr(state, field.name)) for field in fields})
 
 
 def assert_same_arrays(
@@ -69,10 +115,32 @@ def assert_same_arrays(
 def assert_same_state(actual: SimState, expected: SimState, atol: float = 0.0) -> None:
     """Equal states; floats equal within atol."""
     assert_same_arrays(arrays_of(actual), arrays_of(expected), atol)
+    if actual.contacts is None or expected.contacts is None:
+        assert actual.contacts is expected.contacts
+        return
+    mine, theirs = (
+        [[contact.links for contact in contacts] for contacts in state.contacts or ()]
+        for state in (actual, expected)
+    )
+    assert mine == theirs
+    for contacts, others in zip(actual.contacts, expected.contacts, strict=True):
+        depths, expected_depths = [c.depth for c in contacts], [c.depth for c in others]
+        np.testing.assert_allclose(depths, expected_depths, rtol=0.0, atol=atol)
+
+
+def _away(robot: RobotModel, distance: float) -> Floats:
+    """A configuration (J,) with each joint this far from home, rad, on the side with more room; less at a limit."""
+    up = robot.upper - robot.home >= robot.home - robot.lower
+    return np.clip(robot.home + np.where(up, distance, -distance), robot.lower, robot.upper)
+
+
+def _all_at(backend: Backend, q: Floats) -> Floats:
+    """The same configuration (J,) for every arm (N, J)."""
+    return np.tile(q, (backend.num_envs, 1))
 
 
 def _reset(backend: Backend, seed: int = 0) -> Floats:
-    """Put the arms at configurations of their own."""
+    """Put each arm at a random configuration."""
     q = uniform_q(backend.robot, backend.num_envs, seed)
     backend.reset(q)
     return q
@@ -80,54 +148,89 @@ def _reset(backend: Backend, seed: int = 0) -> Floats:
 
 def _run(backend: Backend, steps: int, seed: int = 1) -> list[SimState]:
     """The states of a number of steps towards random targets."""
-    rng = np.random.default_rng(seed)
-    targets = rng.uniform(-2.3, 2.3, (steps, backend.num_envs, backend.robot.num_joints))
-    return [backend.step(target) for target in targets]
+    targets = uniform_q(backend.robot, steps * backend.num_envs, seed, furthest=2.3)
+    return [backend.step(target) for target in np.split(targets, steps)]
 
 
 def _assert_same_run(backend: Backend, other: Backend) -> None:
-    for mine, yours in zip(_run(backend, 10, seed=2), _run(other, 10, seed=2), strict=True):
-        assert_same_state(yours, mine)
+    for mine, theirs in zip(_run(backend, 10, seed=2), _run(other, 10, seed=2), strict=True):
+        assert_same_state(theirs, mine)
 
 
 class BackendContract:
-    """What every backend must do, with MARA; a subclass gives the fixture `make`."""
+    """What every backend must do, with any robot that can collide; a subclass gives the fixture `make`."""
 
-    def test_a_state_has_the_shapes_and_types_it_promises(self, make: Make) -> None:
+    @pytest.fixture
+    def robot(self, make: Make) -> RobotModel:
+        """The robot of the backends that `make` makes."""
+        return make(1).robot
+
+    def test_the_attributes_have_their_shapes_and_ranges(
+        self, make: Make, robot: RobotModel
+    ) -> None:
+        backend = make(2)
+        assert backend.num_envs == 2
+        assert backend.joint_velocity.shape == (robot.num_joints,)
+        assert (backend.joint_velocity > 0.0).all()
+        assert 0.0 < backend.control_period < np.inf
+
+    def test_a_state_has_the_documented_shapes_and_types(
+        self, make: Make, robot: RobotModel
+    ) -> None:
         backend = make(3)
         _reset(backend)
+        joints = robot.num_joints
+        shapes: dict[str, Any] = {
+            "q": ((3, joints), np.float64),
+            "qd": ((3, joints), np.float64),
+            "ee_position": ((3, 3), np.float64),
+            "ee_quaternion": ((3, 4), np.float64),
+            "ee_velocity": ((3, 3), np.float64),
+            "collided": ((3,), np.bool_),
+            "time": ((3,), np.float64),
+        }
+        may_be_none = {"torque": ((3, joints), np.float64), "diverged": ((3,), np.bool_)}
         for state in (backend.state, *_run(backend, 2)):
-            shapes = {
-                name: (array.shape, array.dtype.type) for name, array in arrays_of(state).items()
-            }
-            assert shapes == {
-                "q": ((3, 6), np.float64),
-                "qd": ((3, 6), np.float64),
-                "ee_position": ((3, 3), np.float64),
-                "ee_quaternion": ((3, 4), np.float64),
-                "ee_velocity": ((3, 3), np.float64),
-                "collided": ((3,), np.bool_),
-                "time": ((3,), np.float64),
-            }
-            for name, array in arrays_of(state).items():
+            shapes |= {n: s for n, s in may_be_none.items() if getattr(state, n) is not None}
+            arrays = arrays_of(state)
+            own = {n: (a.shape, a.dtype.type) for n, a in arrays.items() if "." not in n}
+            assert own == shapes
+            for name, array in arrays.items():
+                assert len(array) == 3, name
                 assert np.isfinite(array).all(), name
+            assert state.diverged is None or not state.diverged.any()
+
+    def test_the_same_fields_are_none_in_every_state(self, make: Make, robot: RobotModel) -> None:
+        backend = make(2)
+        states = [backend.state]
+        _reset(backend)
+        states += [backend.state, *_run(backend, 2)]
+        snapshot = backend.save()
+        backend.reset(_all_at(backend, robot.home), np.array([True, False]))
+        states.append(backend.state)
+        backend.restore(snapshot)
+        states.append(backend.state)
+        names = [field.name for field in dataclasses.fields(SimState)]
+        assert len({tuple(getattr(s, name) is None for name in names) for s in states}) == 1
 
     def test_reset_puts_the_arms_at_rest_at_q_with_time_at_zero(self, make: Make) -> None:
         backend = make(3)
         _run(backend, 3)
         q = _reset(backend)
-        np.testing.assert_array_equal(backend.state.q, q)
-        for array in (backend.state.qd, backend.state.ee_velocity, backend.state.time):
+        state = backend.state
+        np.testing.assert_array_equal(state.q, q)
+        for array in (state.qd, state.ee_velocity, state.time):
             assert not array.any()
+        assert state.torque is None or not state.torque.any()
 
-    def test_reset_takes_a_copy_of_q(self, make: Make) -> None:
+    def test_reset_takes_a_copy_of_q(self, make: Make, robot: RobotModel) -> None:
         backend = make(2)
         q = _reset(backend)
         kept = q.copy()
         _run(backend, 1)
         np.testing.assert_array_equal(q, kept)
         backend.reset(q)
-        q[...] = 0.1
+        q[...] = robot.home
         np.testing.assert_array_equal(backend.state.q, kept)
 
     def test_the_pose_is_that_of_the_robot_at_q(self, make: Make) -> None:
@@ -147,7 +250,7 @@ class BackendContract:
             velocity = backend.robot.kinematics().velocity(state.q, state.qd)
             np.testing.assert_allclose(state.ee_velocity, velocity, rtol=0.0, atol=1e-9)
 
-    def test_joints_are_no_faster_than_the_backend_says(self, make: Make) -> None:
+    def test_joints_are_not_faster_than_joint_velocity(self, make: Make) -> None:
         backend = make(3)
         _reset(backend)
         for state in _run(backend, 5):
@@ -159,21 +262,23 @@ class BackendContract:
         for number, state in enumerate(_run(backend, 4), start=1):
             np.testing.assert_allclose(state.time, number * backend.control_period, atol=1e-12)
 
-    def test_a_step_moves_the_arm_towards_its_target(self, make: Make) -> None:
+    def test_a_step_moves_the_arm_towards_its_target(self, make: Make, robot: RobotModel) -> None:
         backend = make(1)
-        backend.reset(np.zeros((1, 6)))
-        target = np.full((1, 6), -0.5)
+        backend.reset(robot.home[None])
+        target = _away(robot, 0.5)[None]
         before = np.abs(backend.state.q - target)
         after = np.abs(backend.step(target).q - target)
         assert (after < before).all()
+        assert backend.teleports == (not after.any())
 
-    def test_step_leaves_the_target_as_it_is_and_takes_a_copy(self, make: Make) -> None:
+    def test_step_takes_a_copy_of_the_target(self, make: Make, robot: RobotModel) -> None:
         backend = make(2)
-        backend.reset(np.zeros((2, 6)))
-        target = np.full((2, 6), 0.4)
+        backend.reset(_all_at(backend, robot.home))
+        target = _all_at(backend, _away(robot, 0.4))
+        kept = target.copy()
         first = backend.step(target)
-        np.testing.assert_array_equal(target, np.full((2, 6), 0.4))
-        target[...] = -1.0
+        np.testing.assert_array_equal(target, kept)
+        target[...] = robot.home
         assert_same_state(backend.state, first)
 
     def test_the_state_after_a_step_is_what_the_step_returned(self, make: Make) -> None:
@@ -183,79 +288,117 @@ class BackendContract:
             (returned,) = _run(backend, 1)
             assert_same_state(backend.state, returned)
 
-    def test_a_state_is_never_changed_afterwards(self, make: Make) -> None:
+    def test_a_state_does_not_change_later(self, make: Make, robot: RobotModel) -> None:
         backend = make(3)
         _reset(backend)
         states = [backend.state, *_run(backend, 2)]
-        kept = [{name: a.copy() for name, a in arrays_of(state).items()} for state in states]
+        kept = copy.deepcopy(states)
         _run(backend, 3)
-        backend.reset(np.zeros((3, 6)), np.array([True, False, False]))
+        mask = np.array([True, False, False])
+        backend.begin_episodes(np.arange(3, dtype=np.uint64), mask)
+        backend.reset(_all_at(backend, robot.home), mask)
         _reset(backend, seed=5)
         for state, before in zip(states, kept, strict=True):
-            assert_same_arrays(arrays_of(state), before)
+            assert_same_state(state, before)
 
-    def test_who_writes_into_a_state_changes_no_other(self, make: Make) -> None:
+    def test_writing_to_a_state_changes_no_other(self, make: Make) -> None:
         backend = make(2)
         _reset(backend)
         (state,) = _run(backend, 1)
         before = copy.deepcopy(backend.state)
         for array in arrays_of(state).values():
-            array[...] = 1
+            if array.flags.writeable:
+                array[...] = 1
         assert_same_state(backend.state, before)
 
-    def test_a_masked_reset_touches_none_but_those_it_names(self, make: Make) -> None:
+    def test_a_masked_reset_leaves_the_other_arms_alone(
+        self, make: Make, robot: RobotModel
+    ) -> None:
         backend, untouched = make(3), make(3)
+        home, near, other = (_all_at(backend, _away(robot, d)) for d in (0.0, 0.3, 0.7))
         for each in (backend, untouched):
-            each.reset(np.zeros((3, 6)))
+            each.reset(home)
             for _ in range(2):
-                each.step(np.full((3, 6), 0.3))
+                each.step(near)
         mask = np.array([False, True, False])
-        backend.reset(np.full((3, 6), -0.7), mask)
-        state, before = backend.state, untouched.state
-        np.testing.assert_array_equal(state.q[1], np.full(6, -0.7))
+        backend.reset(other, mask)
+        state = backend.state
+        np.testing.assert_array_equal(state.q[1], other[1])
         assert state.time[1] == 0.0
         assert not state.qd[1].any()
-        others = {name: array[~mask] for name, array in arrays_of(state).items()}
-        assert_same_arrays(others, {n: array[~mask] for n, array in arrays_of(before).items()})
-        later, expected = backend.step(np.zeros((3, 6))), untouched.step(np.zeros((3, 6)))
-        others = {name: array[~mask] for name, array in arrays_of(later).items()}
-        assert_same_arrays(others, {n: array[~mask] for n, array in arrays_of(expected).items()})
+        assert_same_state(arms_of(state, ~mask), arms_of(untouched.state, ~mask))
+        later, expected = backend.step(home), untouched.step(home)
+        assert_same_state(arms_of(later, ~mask), arms_of(expected, ~mask))
 
-    def test_right_after_a_reset_collided_says_whether_links_touch(self, make: Make) -> None:
+    def test_right_after_a_reset_collided_says_whether_links_touch(
+        self, make: Make, robot: RobotModel
+    ) -> None:
         backend = make(2)
-        backend.reset(np.array([COLLIDING_Q, np.zeros(6)]))
+        free, colliding = robot.home, np.array(colliding_q(robot))
+        backend.reset(np.array([colliding, free]))
         assert backend.state.collided.tolist() == [True, False]
-        backend.reset(np.zeros((2, 6)), np.array([True, False]))
+        backend.reset(np.array([free, free]), np.array([True, False]))
         assert backend.state.collided.tolist() == [False, False]
-        backend.reset(np.array([COLLIDING_Q] * 2), np.array([False, True]))
+        backend.reset(np.array([colliding, colliding]), np.array([False, True]))
         assert backend.state.collided.tolist() == [False, True]
 
-    def test_a_collision_on_the_way_is_reported(self, make: Make) -> None:
+    def test_a_collision_on_the_way_is_reported(self, make: Make, robot: RobotModel) -> None:
         backend = make(2)
-        backend.reset(np.zeros((2, 6)))
-        target = np.array([COLLIDING_Q, np.zeros(6)])
+        backend.reset(_all_at(backend, robot.home))
+        target = np.array([colliding_q(robot), robot.home])
         collided = np.array([backend.step(target).collided for _ in range(200)])
         assert collided.any(axis=0).tolist() == [True, False]
+
+    def test_contacts_are_reported_for_exactly_the_arms_that_collided(
+        self, make: Make, robot: RobotModel
+    ) -> None:
+        backend = make(3)
+        backend.reset(np.array([colliding_q(robot), robot.home, _away(robot, 0.7)]))
+        for state in (backend.state, *_run(backend, 5)):
+            if state.contacts is None:
+                continue
+            assert isinstance(state.contacts, tuple)
+            assert [bool(contacts) for contacts in state.contacts] == state.collided.tolist()
+            for contact in (c for contacts in state.contacts for c in contacts):
+                assert isinstance(contact, Contact)
+                assert contact.links == tuple(sorted(contact.links))
+                assert frozenset(contact.links) in robot.collision_pairs
+                assert 0.0 <= contact.depth < np.inf
+
+    def test_parameters_are_drawn_from_each_arms_seed(self, make: Make) -> None:
+        backend = make(3)
+        every, second = np.ones(3, np.bool_), np.array([False, True, False])
+        drawn = []
+        for seeds, mask in (([1, 2, 3], every), ([7, 7, 7], second), ([1, 2, 3], second)):
+            backend.begin_episodes(np.array(seeds, np.uint64), mask)
+            _reset(backend)
+            drawn.append(copy.deepcopy(backend.state.parameters))
+        assert (drawn[0] is not None) == backend.random
+        first, other, again = (parameters or {} for parameters in drawn)
+        for name, values in first.items():
+            assert (values[0] != values[1]).any(), name
+            assert (values[1] != other[name][1]).any(), name
+            np.testing.assert_array_equal(values[~second], other[name][~second])
+            np.testing.assert_array_equal(values, again[name])
 
     @pytest.mark.parametrize("count", [3, 40])
     def test_an_arm_does_not_depend_on_the_others(self, make: Make, count: int) -> None:
         together = make(count)
-        q = _reset(together)
-        # Some joints rest: the arms' ways differ in length.
+        q, joints = _reset(together), together.robot.num_joints
+        # Some joints rest, so that the paths of the arms differ in length.
         rng = np.random.default_rng(3)
-        rests = rng.random((6, count, 6)) < rng.random((6, count, 1))
-        targets = np.where(rests, q, rng.uniform(-2.3, 2.3, (6, count, 6)))
+        rests = rng.random((6, count, joints)) < rng.random((6, count, 1))
+        moves = uniform_q(together.robot, 6 * count, seed=3, furthest=2.3)
+        targets = np.where(rests, q, moves.reshape(rests.shape))
         states = [together.step(target) for target in targets]
         for arm in range(0, count, max(1, count // 8)):
             one = slice(arm, arm + 1)
             alone = make(1)
             alone.reset(q[one])
             for state, target in zip(states, targets, strict=True):
-                expected = arrays_of(alone.step(target[one]))
-                mine = {name: array[one] for name, array in arrays_of(state).items()}
-                assert_same_arrays(mine, expected, atol=1e-12)
+                assert_same_state(arms_of(state, one), alone.step(target[one]), atol=1e-12)
 
-    def test_from_a_snapshot_it_goes_on_identically(self, make: Make) -> None:
+    def test_from_a_snapshot_it_continues_identically(self, make: Make) -> None:
         backend = make(3)
         _reset(backend)
         _run(backend, 3)
@@ -267,9 +410,11 @@ class BackendContract:
             for mine, again in zip(first, _run(backend, 4), strict=True):
                 assert_same_state(again, mine)
 
-    def test_a_snapshot_of_just_after_a_reset_holds_too(self, make: Make) -> None:
+    def test_a_snapshot_taken_right_after_a_reset_is_complete(
+        self, make: Make, robot: RobotModel
+    ) -> None:
         backend = make(2)
-        backend.reset(np.array([COLLIDING_Q, np.zeros(6)]))
+        backend.reset(np.array([colliding_q(robot), robot.home]))
         snapshot = backend.save()
         _run(backend, 2)
         backend.restore(snapshot)
@@ -278,13 +423,14 @@ class BackendContract:
 
     def test_a_snapshot_pickles_and_fits_another_backend_made_alike(self, make: Make) -> None:
         backend, other = make(3), make(3)
+        backend.begin_episodes(np.arange(3, dtype=np.uint64), np.ones(3, np.bool_))
         _reset(backend)
         _run(backend, 3)
         other.restore(pickled(backend.save()))
         _assert_same_run(backend, other)
 
     @pytest.mark.parametrize("duplicate", COPIES)
-    def test_a_copy_goes_on_identically_and_apart(
+    def test_a_copy_continues_identically_and_independently(
         self, make: Make, duplicate: Callable[[Backend], Backend]
     ) -> None:
         backend = make(3)
@@ -296,13 +442,13 @@ class BackendContract:
         assert_same_state(backend.state, state)
         _assert_same_run(duplicate(backend), backend)
 
-    def test_equal_backends_do_equally(self, make: Make) -> None:
+    def test_equal_backends_compute_equal_states(self, make: Make) -> None:
         backend, other = make(3), make(3)
         _reset(backend)
         _reset(other)
         _assert_same_run(backend, other)
 
-    def test_limits_are_kept_where_targets_are_at_them(self, make: Make) -> None:
+    def test_joints_stay_within_their_limits_where_targets_are_at_them(self, make: Make) -> None:
         backend = make(2)
         robot = backend.robot
         backend.reset(np.array([robot.lower, robot.upper]))
@@ -311,7 +457,7 @@ class BackendContract:
             assert (state.q >= robot.lower).all()
             assert (state.q <= robot.upper).all()
 
-    def test_close_frees_it(self, make: Make) -> None:
+    def test_a_state_outlives_its_backend(self, make: Make) -> None:
         backend = make(1)
         _reset(backend)
         (state,) = _run(backend, 1)

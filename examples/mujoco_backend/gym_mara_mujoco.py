@@ -1,4 +1,4 @@
-"""The backend "mujoco": MuJoCo integrates the arms' motion, with position servos on the joints and contact."""
+"""The backend "mujoco": MuJoCo integrates the motion of the arms, with position servos and contact."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from gym_mara.backends import Backend
-from gym_mara.backends.servo import servo_motion, step_times
+from gym_mara.backends.servo import Motion, ServoBackend
 from gym_mara.collision import make_checker
-from gym_mara.errors import GymMaraError, positive_number
+from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
-from gym_mara.state import SimState
+from gym_mara.state import Contact
+from gym_mara.types import Floats
 
 _WANTED = "the backend 'mujoco' needs MuJoCo 3.3 or newer: pip install 'mujoco>=3.3'"
 try:
@@ -24,33 +23,29 @@ except ImportError as error:
 if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) < (3, 3):
     raise GymMaraError(f"{_WANTED}; this is {mujoco.__version__}")
 
-Floats = NDArray[np.float64]
-
-# All that the next step depends on, also where the solver starts from.
+# All that the next step depends on, the solver's starting point included.
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-# How hard a motor is, from 0 to 1: MuJoCo allows no more.
+# The impedance of a motor's constraint, between 0 and 1: the highest that MuJoCo allows.
 _HARD = mujoco.mjMAXIMP
 
 
-class MujocoBackend(Backend):
-    """Full dynamics: gravity, inertia, contact, and motors that are only so strong and so fast.
+class MujocoBackend(ServoBackend):
+    """Full dynamics by MuJoCo.
 
-    Each joint has a position servo: its motor is commanded the velocity clip(gain · (target - q), ± the URDF's velocity
-    limit) at every physics step, and exerts what torque that takes up to the URDF's effort limit.
-
-    MuJoCo takes meshes for their convex hulls, and what touches pushes. Where it has a contact, Coal says whether it
-    counts as a collision: so `collided` is the same at equal q as in the other backends.
+    MuJoCo replaces a mesh by its convex hull, and hulls that touch push each other. Where it has a contact, Coal decides
+    on the meshes whether the arm has collided: so `collided` is the same at equal q as in the other backends.
 
     Args:
         robot: the arm.
-        num_envs: how many of it.
+        num_envs: the number of arms.
         control_period: s.
-        physics_step: s; a whole number of them makes a control period.
+        physics_step: s; a control period is a whole number of them.
         max_joint_velocity: rad/s (m/s), where it is below the URDF's limits; None for those.
         servo_gain: 1/s.
+        on_divergence: what follows when an arm's state diverges: "error", or "truncate" to end the arm's episode.
 
     Raises:
-        GymMaraError: a setting is out of its range, or MuJoCo does not take the robot.
+        GymMaraError: a setting is out of its range, or MuJoCo cannot load the robot.
     """
 
     # Python commands the motors at every physics step, and holds its lock meanwhile.
@@ -65,141 +60,102 @@ class MujocoBackend(Backend):
         physics_step: float = 0.002,
         max_joint_velocity: float | None = None,
         servo_gain: float = 10.0,
+        on_divergence: str = "error",
     ) -> None:
-        super().__init__(robot, num_envs, control_period=control_period)
-        self._settings = {
-            "control_period": control_period,
-            "physics_step": physics_step,
-            "max_joint_velocity": max_joint_velocity,
-            "servo_gain": servo_gain,
-        }
-        self.physics_step = positive_number("physics_step", physics_step, "s")
-        self._times = step_times(self.control_period, self.physics_step)[:, None, None]
-        if max_joint_velocity is not None:
-            limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
-            self.joint_velocity = np.minimum(limit, robot.velocity_limit)
-        self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
-        self._gain = np.full(robot.num_joints, self.servo_gain)
-        self._kinematics = robot.kinematics()
+        super().__init__(
+            robot,
+            num_envs,
+            control_period=control_period,
+            physics_step=physics_step,
+            max_joint_velocity=max_joint_velocity,
+            servo_gain=servo_gain,
+            on_divergence=on_divergence,
+        )
         self._checker = make_checker("coal", robot)
         self._model = build_model(robot, self.physics_step)
-        # Of MuJoCo's constraints those of the joints' friction come first, those of the motors next.
+        # MuJoCo orders its constraints: first those of the joints' friction, then those of the motors.
         first = np.count_nonzero(self._model.dof_frictionloss)
         self._motors = slice(first, first + robot.num_joints)
+        names = [shape.name for shape in robot.geometry.geometryObjects]
+        geoms = [names.index(self._model.geom(index).name) for index in range(self._model.ngeom)]
+        self._links = [robot.link_of(index) for index in geoms]
         self._arms = [mujoco.MjData(self._model) for _ in range(num_envs)]
-        self._torque = np.zeros((num_envs, robot.num_joints))
-        self._collided = np.zeros(num_envs, dtype=np.bool_)
         self.reset(np.tile(robot.home, (num_envs, 1)))
 
-    def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
-        """Put the arms that the mask names, or all, at rest at q."""
-        rows = np.ones(self.num_envs, np.bool_) if mask is None else mask
-        for index in np.flatnonzero(rows).tolist():
-            arm = self._arms[index]
-            mujoco.mj_resetData(self._model, arm)
-            arm.qpos[:] = q[index]
-            mujoco.mj_step1(self._model, arm)
-            self._torque[index] = 0.0
-            self._collided[index] = self._collides(arm)
-
-    def step(self, q_target: Floats) -> SimState:
-        """Plan what velocities the servos command in this period, and run the arms, one after the other."""
-        q = np.array([arm.qpos for arm in self._arms])
-        path = servo_motion(q, q_target, self._gain, self.joint_velocity, self._times)
-        velocities = np.diff(path, axis=0) / self.physics_step
-        for index in range(self.num_envs):
-            self._run(index, velocities[:, index])
-        return self.state
-
-    def _run(self, index: int, velocities: Floats) -> None:
-        """One physics step of an arm for each row of commanded joint velocities (K, J).
-
-        An arm is always left between the two halves of a step: contacts and constraints are those of where it is.
-        """
-        arm, collided = self._arms[index], False
-        for velocity in velocities:
-            # The motors' friction, made for a shaft at rest, is told how its shaft turns; see `_add_joint`.
-            arm.efc_aref[self._motors] = (velocity - arm.qvel) / self.physics_step
-            mujoco.mj_step2(self._model, arm)
-            self._torque[index] = arm.efc_force[self._motors]
-            mujoco.mj_step1(self._model, arm)
-            collided = collided or self._collides(arm)
-        self._collided[index] = collided
-        if not (np.isfinite(arm.qpos).all() and np.isfinite(arm.qvel).all()):
-            raise GymMaraError(
-                f"the simulation of arm {index} diverged; a shorter physics_step may help"
-            )
-
-    def _collides(self, arm: mujoco.MjData) -> bool:
-        """Whether links touch where the arm is; without a contact of their hulls they do not."""
-        return arm.ncon > 0 and bool(self._checker.check(arm.qpos[None])[0])
-
-    @property
-    def state(self) -> SimState:
-        """The state now."""
-        # MuJoCo's constraints are soft: they let a joint slip past its limits by a little.
-        q = np.clip([arm.qpos for arm in self._arms], self.robot.lower, self.robot.upper)
-        qd = np.clip([a.qvel for a in self._arms], -self.joint_velocity, self.joint_velocity)
-        position, quaternion = self._kinematics.pose(q)
-        return SimState(
-            q=q,
-            qd=qd,
-            ee_position=position,
-            ee_quaternion=quaternion,
-            ee_velocity=self._kinematics.velocity(q, qd),
-            collided=self._collided.copy(),
-            time=np.array([arm.time for arm in self._arms]),
+    def _run(self, velocities: Floats) -> Motion:
+        runs = [self._run_arm(arm, velocities[:, index]) for index, arm in enumerate(self._arms)]
+        return Motion(
+            q=np.array([arm.qpos for arm in self._arms]),
+            qd=np.array([arm.qvel for arm in self._arms]),
+            torque=np.array([torque for torque, _ in runs]),
+            contacts=[contacts for _, contacts in runs],
         )
 
-    def report(self) -> dict[str, NDArray[Any]]:
-        """What the motors exerted in the last physics step (N, J), Nm."""
-        return {"joint_torque": self._torque.copy()}
+    def _run_arm(
+        self, arm: mujoco.MjData, velocities: Floats
+    ) -> tuple[Floats, tuple[Contact, ...]]:
+        """One physics step of an arm for each row of commanded joint velocities (K, J); the last torque, and the contacts.
+
+        An arm is always left between the two halves of a step: its contacts and constraints are those of its current q.
+        """
+        deepest: dict[tuple[str, str], float] = {}
+        for velocity in velocities:
+            # The motor's friction is made for a shaft at rest; this makes the shaft turn, see `_add_joint`.
+            arm.efc_aref[self._motors] = (velocity - arm.qvel) / self.physics_step
+            mujoco.mj_step2(self._model, arm)
+            torque = arm.efc_force[self._motors].copy()
+            mujoco.mj_step1(self._model, arm)
+            for contact in self._contacts_of(arm):
+                deepest[contact.links] = max(contact.depth, deepest.get(contact.links, 0.0))
+        return torque, tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
+
+    def _contacts_of(self, arm: mujoco.MjData) -> list[Contact]:
+        """MuJoCo's contacts where the arm is now; none where the links' meshes do not touch, although their hulls may."""
+        if arm.ncon == 0 or not self._checker.check(arm.qpos[None])[0]:
+            return []
+        found = zip(arm.contact.geom.tolist(), arm.contact.dist.tolist(), strict=True)
+        pairs = [(sorted(self._links[geom] for geom in geoms), dist) for geoms, dist in found]
+        return [Contact((one, other), max(-dist, 0.0)) for (one, other), dist in pairs]
+
+    def _put_at_rest(self, arm: int, q: Floats) -> tuple[Contact, ...]:
+        self._set_state(arm, q, np.zeros_like(q))
+        return tuple(self._contacts_of(self._arms[arm]))
+
+    def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
+        self._set_state(arm, q, qd)
+
+    def _set_state(self, arm: int, q: Floats, qd: Floats) -> None:
+        data = self._arms[arm]
+        mujoco.mj_resetData(self._model, data)
+        data.qpos[:], data.qvel[:] = q, qd
+        mujoco.mj_step1(self._model, data)
 
     def save(self) -> dict[str, Any]:
-        """MuJoCo's state of every arm (N, S), and what it does not tell."""
+        """A snapshot, with MuJoCo's state of every arm (N, S)."""
         states = np.empty((self.num_envs, mujoco.mj_stateSize(self._model, _STATE)))
         for arm, state in zip(self._arms, states, strict=True):
             mujoco.mj_getState(self._model, arm, state, _STATE)
-        return {
-            "states": states,
-            "torque": self._torque.copy(),
-            "collided": self._collided.copy(),
-        }
+        return super().save() | {"states": states}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot; what follows from a state is computed anew."""
-        if snapshot["torque"].shape != self._torque.shape:
-            raise GymMaraError(
-                f"the snapshot is of arms {snapshot['torque'].shape}; these are {self._torque.shape}"
-            )
+        """Return to a snapshot; MuJoCo computes anew what follows from a state."""
+        super().restore(snapshot)
         for arm, state in zip(self._arms, snapshot["states"], strict=True):
             mujoco.mj_setState(self._model, arm, state, _STATE)
             mujoco.mj_step1(self._model, arm)
-        self._torque, self._collided = snapshot["torque"].copy(), snapshot["collided"].copy()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self.robot, self.num_envs, self._settings, self.save())
-
-
-def _restored(
-    robot: RobotModel, num_envs: int, settings: dict[str, Any], snapshot: dict[str, Any]
-) -> MujocoBackend:
-    backend = MujocoBackend(robot, num_envs, **settings)
-    backend.restore(snapshot)
-    return backend
 
 
 def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
     """MuJoCo's model of a robot: a body for each joint, a motor on each joint, and the pairs that may collide.
 
     Raises:
-        GymMaraError: MuJoCo does not take it.
+        GymMaraError: MuJoCo cannot load it.
     """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = physics_step
     spec.option.gravity = robot.model.gravity.linear
-    # An arm that the engine loses is to be told of, not put back behind our back.
+    # Where an arm's state diverges MuJoCo would silently reset it.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
     bodies = [spec.worldbody]
     for number in range(1, robot.model.njoints):
@@ -212,17 +168,18 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
     try:
         model = spec.compile()
     except ValueError as error:
-        raise GymMaraError(f"MuJoCo does not take the robot {robot.name!r}: {error}") from error
-    # One number a joint here, in every version of MuJoCo; not so in MjSpec.
+        raise GymMaraError(f"MuJoCo cannot load the robot {robot.name!r}: {error}") from error
+    # Here it is one number per joint in every version of MuJoCo; in MjSpec it is not.
     model.dof_damping[:] = robot.model.damping
     return model
 
 
 def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
-    """Add a joint of Pinocchio's model, what it carries, and its motor; return the body.
+    """Add a joint of Pinocchio's model, the body that it carries, and its motor; returns the body.
 
-    A motor is a clutch between the joint and a shaft that turns as commanded, and slips beyond the effort limit:
-    friction on a tendon that only the joint pulls. So MuJoCo's solver finds its torque together with the contacts'.
+    A motor acts like a clutch between the joint and a shaft that turns as commanded; it slips beyond the effort limit.
+    It is modelled as friction on a tendon that only this joint pulls, so that MuJoCo's solver computes the motors' torques
+    together with the contact forces.
     """
     name, inertia = robot.model.names[number], robot.model.inertias[number]
     body = parent.add_body(
@@ -243,7 +200,7 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
         frictionloss=robot.model.friction[number - 1],
     )
     motor = spec.add_tendon(
-        # MuJoCo has no constraint for a motor without any strength.
+        # MuJoCo makes no constraint for friction of zero.
         frictionloss=max(robot.effort_limit[number - 1], mujoco.mjMINVAL),
         solimp_friction=(_HARD, _HARD, 1.0, 0.5, 1.0),
     )
@@ -252,7 +209,7 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
 
 
 def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
-    """Add one of Pinocchio's geometry objects; it touches only what a pair says."""
+    """Add one of Pinocchio's geometry objects; it collides only in the pairs that `build_model` adds."""
     geometry, kinds = shape.geometry, mujoco.mjtGeom
     name = type(geometry).__name__
     options: dict[str, Any]
@@ -267,7 +224,7 @@ def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
         spec.add_mesh(
             name=shape.name,
             uservert=geometry.vertices().ravel(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # of no account, but must be one
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
         )
         options = {"type": kinds.mjGEOM_MESH, "meshname": shape.name}
     else:
@@ -276,6 +233,6 @@ def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:
-    """A placement in MuJoCo's words: position, and quaternion [w, x, y, z]."""
+    """A placement as MuJoCo's keyword arguments: position, and quaternion [w, x, y, z]."""
     *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
     return {"pos": position, "quat": [w, x, y, z]}

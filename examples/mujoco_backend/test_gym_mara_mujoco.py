@@ -94,7 +94,8 @@ def test_a_target_is_reached_and_held_against_gravity(mara: RobotModel) -> None:
         np.testing.assert_allclose(state.q, target, atol=1e-4)
         np.testing.assert_allclose(state.qd, 0.0, atol=1e-4)
     gravity = pin.computeGeneralizedGravity(mara.model, mara.model.createData(), target[0])
-    np.testing.assert_allclose(backend.report()["joint_torque"][0], gravity, atol=0.05)
+    assert state.torque is not None
+    np.testing.assert_allclose(state.torque[0], gravity, atol=0.05)
 
 
 def test_a_slide_with_friction_follows_too(slider: RobotModel) -> None:
@@ -114,7 +115,8 @@ def test_the_motors_keep_within_their_limits(robot: RobotModel) -> None:
         state = backend.step(rng.uniform(low, high, (4, robot.num_joints)))
         assert (np.abs(state.qd) <= backend.joint_velocity).all()
         assert ((state.q >= robot.lower) & (state.q <= robot.upper)).all()
-        efforts.append(np.abs(backend.report()["joint_torque"]))
+        assert state.torque is not None
+        efforts.append(np.abs(state.torque))
     assert (np.max(efforts, axis=(0, 1)) <= robot.effort_limit).all()
 
 
@@ -147,7 +149,8 @@ def test_a_motor_too_weak_to_hold_its_load_lets_it_fall(slider: RobotModel) -> N
     for _ in range(10):
         state = backend.step(side)
     assert state.q[0, 1] < 1.4
-    assert backend.report()["joint_torque"][0, 1] == slider.effort_limit[1]
+    assert state.torque is not None
+    assert state.torque[0, 1] == slider.effort_limit[1]
 
 
 def test_at_equal_q_it_sees_the_collisions_that_the_pinocchio_backend_sees(

@@ -1,4 +1,4 @@
-"""RL Baselines3 Zoo with ACKTR among its algorithms; everything else is its own.
+"""RL Baselines3 Zoo with ACKTR as an additional algorithm.
 
 python examples/rl_zoo3/zoo.py train --algo acktr --env gym_mara/MARA-v0 --conf-file examples/rl_zoo3/acktr.yml -f /tmp/zoo
 python examples/rl_zoo3/zoo.py enjoy --algo acktr --env gym_mara/MARA-v0 -f /tmp/zoo --no-render -n 2048
@@ -17,13 +17,13 @@ with needs("this example", "zoo"):
     from rl_zoo3.enjoy import enjoy
     from rl_zoo3.train import train
 
-# All modules of the zoo hold this one dictionary: it is added to, not replaced.
+# All modules of the zoo share this dictionary: add to it, do not replace it.
 ALGOS["acktr"] = ACKTR
 
 
 def main() -> None:
     """Run the zoo's own command."""
-    # Not by rl_zoo3.cli, which wants the libraries of the zoo's plots as well.
+    # Not with rl_zoo3.cli, which also needs the plotting libraries of the zoo.
     commands = {"train": train, "enjoy": enjoy}
     if sys.argv[1:2] == [] or sys.argv[1] not in commands:
         sys.exit(f"usage: zoo.py {'|'.join(commands)} …")

@@ -1,4 +1,4 @@
-"""The kinematic backend: joints go where they are told, Pinocchio says where that is, FCL or Coal what they hit."""
+"""The kinematic backend: joints move to their targets without forces; Coal or python-fcl checks for collisions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
 from gym_mara.collision import make_checker
@@ -16,31 +15,32 @@ from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
+from gym_mara.types import Floats, Mask
 
-Floats = NDArray[np.float64]
-
-
-# From so many arms on, to remember where there was room costs less than it spares.
-REMEMBER_FROM = 16
-# What a snapshot holds: the arms' configuration, velocity and time, and what they touch.
+CACHE_FROM = 16
+"""From this number of arms on a cached checker is faster."""
 _STATE = ("q", "qd", "time", "collided", "touching")
 
 
 class PinocchioBackend(Backend):
     """Kinematics without dynamics.
 
-    By default the joints are at their targets at once, and at rest there (gym-gazebo2's training mode). With
-    `max_joint_velocity` each moves at most that far a period, and rests when it arrives (its run mode); the arm stops
-    where its path first collides.
+    By default the joints reach their targets within a step and rest there (gym-gazebo2's training mode). With
+    `max_joint_velocity` each joint moves at this velocity until it arrives (its run mode), and the arm stops where its
+    path first collides.
 
     Args:
         robot: the arm.
-        num_envs: how many of it.
+        num_envs: the number of arms.
         control_period: s.
-        max_joint_velocity: rad/s (m/s for a prismatic joint); None for teleports.
-        collision: the collision engine: "coal" (the faster), "fcl", or "none" to see no collisions.
-        collision_threads: how many threads Coal may use; worth it for large batches on idle cores.
-        path_resolution: how far, m, any point of the arm moves at most between two checks along a path.
+        max_joint_velocity: rad/s (m/s for a prismatic joint); None for joints that teleport.
+        collision: the collision engine: "coal" (the faster), "fcl", or "none" for no collisions.
+        collision_threads: how many threads Coal uses; worth it for large batches on idle cores.
+        path_resolution: the longest way of any point of the arm between two checks along a path, m.
+
+    Raises:
+        GymMaraError: a setting is out of its range.
+        MissingExtraError: the collision engine is not installed.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class PinocchioBackend(Backend):
         if self.max_joint_velocity is not None:
             half = np.full(robot.num_joints, 0.5 * self.max_joint_velocity * self.control_period)
             self._with_room = self._checker.with_room(half)
-        elif num_envs >= REMEMBER_FROM and isinstance(
+        elif num_envs >= CACHE_FROM and isinstance(
             self._checker, (CoalChecker, ParallelCoalChecker)
         ):
             self._checker = CachedChecker(robot, self._checker)
@@ -76,10 +76,10 @@ class PinocchioBackend(Backend):
         self._qd = np.zeros_like(self._q)
         self._time = np.zeros(num_envs)
         self._period = np.array(self.control_period)  # NumPy adds it faster than a Python number
-        self._collided: NDArray[np.bool_] | None = None
+        self._collided: Mask | None = None
         self._touching = np.zeros(num_envs, dtype=np.bool_)
 
-    def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, q: Floats, mask: Mask | None = None) -> None:
         rows: Any = slice(None) if mask is None else mask
         self._q[rows] = q[rows]
         self._qd[rows] = 0.0
@@ -97,31 +97,31 @@ class PinocchioBackend(Backend):
         return self.state
 
     def _travel(self, q_target: Floats, velocity: float) -> None:
-        """Move along the path of one period, as far as the first collision on it."""
+        """Move along the path of one period, up to the first collision on it."""
         way, furthest = q_target - self._q, velocity * self.control_period
         length = (np.minimum(np.abs(way), furthest) * self.robot.reach).sum(1)
         samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
         free = np.zeros(self.num_envs, np.bool_)
         if self._with_room is not None:
-            # Where there is room around the middle of a path, all of it is free.
+            # A path is free where the arm, at the middle of it, is far enough from everything.
             long = samples > 1
             middle = self._q[long] + 0.5 * np.clip(way[long], -furthest, furthest)
             free[long] = ~self._with_room.check(middle)
             samples[free] = 1
-        # The samples of all paths in one array, an arm's behind another's: which arm, and which of its samples.
+        # The samples of all paths in one array, arm after arm: the arm, and the number of the sample on its path.
         arm = np.repeat(np.arange(self.num_envs), samples)
         last = np.cumsum(samples) - 1
         sample = np.arange(1, len(arm) + 1) - (last - samples + 1)[arm]
         limit = (furthest * (sample / samples[arm]))[:, None]
         path = self._q[arm] + np.clip(way[arm], -limit, limit)
         arrived = np.abs(way[arm]) <= limit * (1.0 + 1e-9)
-        path[arrived] = q_target[arm][arrived]  # exactly there, not nearly
+        path[arrived] = q_target[arm][arrived]  # exactly, without rounding
         hit, unsure = np.zeros(len(arm), np.bool_), ~free[arm]
         hit[unsure] = self._checker.check(path[unsure])
         first_hit = np.minimum.reduceat(
             np.where(hit, np.arange(len(arm)), len(arm)), last - samples + 1
         )
-        # An arm that was let go on in a collision passes through; any other stops where it comes into one.
+        # An arm that already collided moves on, whatever it touches; any other stops where it first collides.
         stop = np.where(self._touching, last, np.minimum(first_hit, last))
         collided = first_hit <= last
         self._q = path[stop]

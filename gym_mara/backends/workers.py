@@ -1,40 +1,47 @@
-"""A backend spread over processes, for engines that hold Python's lock while they step."""
+"""A backend spread over worker processes, for engines that hold Python's lock while they step."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
+import signal
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+import traceback
+import weakref
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields
-from typing import Any
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
-from gymnasium.vector import AsyncVectorEnv
 from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
+from gym_mara.types import Floats, Mask
 
-Floats = NDArray[np.float64]
+_FIELDS = tuple(field.name for field in fields(SimState))
+_GRACE = 5.0
+"""How long a worker that was asked to end may take before it is killed, s."""
 
 
 class WorkerDiedError(GymMaraError):
-    """A worker process is gone: killed, or out of memory."""
+    """The worker processes have ended: one was killed or ran out of memory, or a step was interrupted."""
 
 
 def choose_workers(num_envs: int, workers: int | None) -> int:
-    """How many processes N arms are spread over: those that were asked for, or as many as there are cores.
+    """The number of processes that N arms are spread over: the one asked for, or as many as there are cores.
 
-    In a process that multiprocessing or Ray has begun it is one: whoever began it shares out the cores.
+    Without a wish it is one in a process that was started by multiprocessing or Ray: the program that started it has
+    already shared out the cores.
 
     Raises:
-        GymMaraError: the arms cannot be shared out equally.
+        GymMaraError: the arms cannot be shared out equally, or the program's main module lacks its guard.
     """
     if workers is not None:
         workers = whole_number("workers", workers)
@@ -44,6 +51,11 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
                 f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
             )
         return workers
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise GymMaraError(
+            "a new process imports the main module of the program, which makes an environment at once; "
+            "put what the program does under `if __name__ == '__main__':`, or give workers=1"
+        )
     if multiprocessing.parent_process() is not None or _in_ray_worker():
         return 1
     return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)
@@ -66,17 +78,21 @@ def cores() -> list[int]:
 
 
 class WorkerBackend(Backend):
-    """N arms in as many equal blocks as there are workers, each a backend in a process of its own.
+    """N arms in equal blocks, each block a backend in its own worker process.
 
-    Gymnasium's AsyncVectorEnv runs the processes and shares the memory in which the states come back. The numbers are
-    those of one process, to the bit.
+    The numbers are those of one process, to the bit, and an error in a block is raised here. A worker ends when this
+    backend is closed or garbage-collected, and when the process that made it ends, however it ends.
 
     Args:
         backend: the class of the backend.
         robot: the arm.
         num_envs: N.
-        workers: how many processes.
+        workers: the number of processes.
         settings: of the backend.
+
+    Raises:
+        GymMaraError: a setting is out of its range.
+        WorkerDiedError: a worker could not be started; or, from any method, the workers have ended.
     """
 
     def __init__(
@@ -88,122 +104,199 @@ class WorkerBackend(Backend):
         settings: dict[str, Any],
     ) -> None:
         self._arguments = (backend, robot, num_envs, workers, settings)
-        pilot = backend(robot, 1, **settings)  # tells what the settings come to
-        super().__init__(robot, num_envs, control_period=pilot.control_period)
-        self.joint_velocity, self.random = pilot.joint_velocity, pilot.random
-        pilot.close()
-        self._sizes = (robot.num_joints, robot.num_joints, 3, 4, 3, 1, 1, 1, 1)
-        size = num_envs // workers
+        example = backend(robot, 1, **settings)
+        super().__init__(robot, num_envs, control_period=example.control_period)
+        self.joint_velocity = example.joint_velocity
+        self.random, self.teleports = example.random, example.teleports
+        example.close()
+        self._states: list[SimState] | None = None
+        self._pipes: list[Connection] = []
+        self.processes: list[BaseProcess] = []
+        """The workers."""
+        self._owner = os.getpid()
+        self._end = weakref.finalize(self, _end, self._owner, self._pipes, self.processes)
+        # One core for each worker where they fill all cores: a scheduler tends to put several on one.
+        numbers: list[int | None] = [*cores()]
+        if len(numbers) != workers or not hasattr(os, "sched_setaffinity"):
+            numbers = [None] * workers
+        with self._all_or_none():
+            for core in numbers:
+                self._start(core, backend, robot, num_envs // workers, settings)
+        try:
+            self._call("make")
+        except BaseException:
+            self._kill()
+            raise
 
-        here, numbers = os.getpid(), cores()
+    def _start(self, core: int | None, *block: Any) -> None:
+        pipe, its_end = multiprocessing.Pipe()
+        self._pipes.append(pipe)
+        _parents_ends.add(pipe)
+        process = multiprocessing.Process(target=_work, args=(its_end, core, *block), daemon=True)
+        process.start()
+        self.processes.append(process)
+        its_end.close()
 
-        def block(index: int) -> Callable[[], _Block]:
-            def make() -> _Block:
-                # One core each where they fill them all: the scheduler wakes several on one, its waker's.
-                if (
-                    os.getpid() != here
-                    and len(numbers) == workers
-                    and hasattr(os, "sched_setaffinity")
-                ):
-                    os.sched_setaffinity(0, {numbers[index]})
-                return _Block(backend(robot, size, **settings), index, sum(self._sizes))
+    def begin_episodes(self, seeds: NDArray[np.uint64], mask: Mask) -> None:
+        self._call("begin_episodes", seeds, mask)
 
-            return make
-
-        self._pool = AsyncVectorEnv([block(index) for index in range(workers)], copy=False)
-        self._tell("nothing")
-
-    def begin_episodes(self, seeds: NDArray[np.uint64], mask: NDArray[np.bool_]) -> None:
-        self._tell("begin_episodes", seeds, mask)
-
-    def reset(self, q: Floats, mask: NDArray[np.bool_] | None = None) -> None:
-        self._tell("reset", q, np.ones(self.num_envs, np.bool_) if mask is None else mask)
+    def reset(self, q: Floats, mask: Mask | None = None) -> None:
+        self._call("reset", q, mask)
 
     def step(self, q_target: Floats) -> SimState:
-        actions = q_target.reshape(self._pool.num_envs, -1, self.robot.num_joints)
-        packed, _, _, _, info = self._guarded(lambda: self._pool.step(actions))
-        self._take(packed, info)
+        self._states = self._call("step", q_target)
         return self.state
 
     @property
     def state(self) -> SimState:
-        return SimState(**self._unpacked())
-
-    @property
-    def sensor_noise(self) -> Floats | None:
-        noise = self._columns()[-1][:, 0]
-        return None if np.isnan(noise).any() else noise.copy()
-
-    def report(self) -> dict[str, NDArray[Any]]:
-        return {key: np.concatenate([r[key] for r in self._reports]) for key in self._reports[0]}
+        if self._states is None:
+            self._states = self._call("state")
+        blocks = self._states
+        return SimState(**{f: _joined([getattr(b, f) for b in blocks]) for f in _FIELDS})
 
     def save(self) -> dict[str, Any]:
-        blocks = self._guarded(lambda: self._pool.call("save"))
-        return {key: _joined([block[key] for block in blocks]) for key in blocks[0]}
+        snapshot: dict[str, Any] = _joined(self._call("save"))
+        return snapshot
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        count = len(next(iter(snapshot.values())))
+        count = _count(snapshot)
         if count != self.num_envs:
             raise GymMaraError(f"the snapshot is of {count} arms; these are {self.num_envs}")
-        size = count // self._pool.num_envs
-        starts = range(0, count, size)
-        blocks = [{key: v[start : start + size] for key, v in snapshot.items()} for start in starts]
-        self._tell("restore", tuple(blocks))
-
-    @property
-    def processes(self) -> list[Any]:
-        """The workers, as multiprocessing knows them."""
-        return list(self._pool.processes)
+        self._call("restore", snapshot)
 
     def close(self) -> None:
-        if not self._pool.closed:
-            with suppress(WorkerDiedError):
-                self._guarded(self._pool.close)
+        self._end()
 
-    def _tell(self, method: str, *values: Any) -> None:
-        """Have every block call a method, with its part of the values, and take the states after it."""
-        parts = [v if isinstance(v, tuple) else np.split(v, self._pool.num_envs) for v in values]
-        options = {"method": method, "parts": parts}
-        self._take(*self._guarded(lambda: self._pool.reset(options=options)))
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self._arguments, self.save())
 
-    def _take(self, packed: Floats, info: dict[str, Any]) -> None:
-        self._packed = packed.reshape(self.num_envs, -1).copy()
-        self._reports = [report for (report,) in info["report"]]
-        diverged = self._columns()[-2][:, 0] != 0.0
-        self.diverged = diverged if diverged.any() else None
+    def _call(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of every block with the rows of the arguments that are its own; the results, block by block.
 
-    def _columns(self) -> list[Floats]:
-        return np.split(self._packed, np.cumsum(self._sizes)[:-1], axis=1)
+        Raises:
+            WorkerDiedError: a worker has ended; then all have.
+            Exception: the first that a block raised; its cause holds the traceback. The workers go on.
+        """
+        if os.getpid() != self._owner:
+            raise GymMaraError(
+                "these arms are in worker processes of another process; make the environment in the process that uses it"
+            )
+        if not self._end.alive:
+            raise WorkerDiedError("the worker processes have ended; make the environment anew")
+        self._states = None
+        size = self.num_envs // len(self._pipes)
+        with self._all_or_none():
+            for index, pipe in enumerate(self._pipes):
+                rows = slice(index * size, (index + 1) * size)
+                pipe.send((method, [_rows(argument, rows) for argument in arguments]))
+            replies = [pickle.loads(pipe.recv_bytes()) for pipe in self._pipes]
+        for reply in replies:
+            if isinstance(reply, _Failure):
+                raise reply.error from _RemoteTraceback(reply.traceback)
+        return replies
 
-    def _unpacked(self) -> dict[str, Any]:
-        columns = [column.copy() for column in self._columns()[: len(_FIELDS)]]
-        state: dict[str, Any] = dict(zip(_FIELDS, columns, strict=True))
-        state["collided"] = state["collided"][:, 0] != 0.0
-        state["time"] = state["time"][:, 0]
-        return state
-
-    def _guarded(self, exchange: Callable[[], Any]) -> Any:
-        """Exchange something with the workers; when one fails, none is left behind."""
+    @contextmanager
+    def _all_or_none(self) -> Iterator[None]:
+        """End all workers where an exchange with them fails: what the others have sent would be taken for a later reply."""
         try:
-            return exchange()
-        except (EOFError, ConnectionError) as error:
-            self._stop()
+            yield
+        except (EOFError, OSError) as error:
+            self._kill()
             raise WorkerDiedError(
                 "a worker process of the simulation died (killed, or out of memory?); make the environment anew, "
                 "with fewer arms or workers if memory was short"
             ) from error
         except BaseException:
-            self._stop()
+            self._kill()
             raise
 
-    def _stop(self) -> None:
-        for process in self._pool.processes:
-            process.terminate()
-            process.join()
-        self._pool.closed = True
+    def _kill(self) -> None:
+        for process in self.processes:
+            process.kill()
+        self._end()
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._arguments, self.save())
+
+def _end(owner: int, pipes: list[Connection], processes: list[BaseProcess]) -> None:
+    """Ask the workers to end, and kill those that do not."""
+    if os.getpid() != owner:
+        return  # a copy of the backend in a forked process
+    for pipe in pipes:
+        with suppress(OSError):
+            pipe.send(None)
+        pipe.close()
+    for process in processes:
+        process.join(_GRACE)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+
+
+# A worker ends when the last copy of the parent's end of its pipe is closed. A fork makes copies: its child closes them.
+_parents_ends: weakref.WeakSet[Connection] = weakref.WeakSet()
+
+
+def _close_copies() -> None:
+    for pipe in _parents_ends:
+        pipe.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_close_copies)
+
+
+class _Failure(NamedTuple):
+    error: Exception
+    traceback: str
+
+
+class _RemoteTraceback(Exception):  # noqa: N818 - it is shown as the cause of an error
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+def _work(
+    pipe: Connection,
+    core: int | None,
+    backend: type[Backend],
+    robot: RobotModel,
+    count: int,
+    settings: dict[str, Any],
+) -> None:
+    """What a worker does: answer each call of a method of its block, until there are no more."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C goes to every process: the parent ends the workers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the parent's handler
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    block: Any = None
+    with suppress(EOFError, OSError):  # the parent has ended
+        while request := pipe.recv():
+            method, arguments = request
+            try:
+                if method == "make":
+                    block, result = backend(robot, count, **settings), None
+                elif method == "state":
+                    result = block.state
+                else:
+                    result = getattr(block, method)(*arguments)
+                reply = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+            except Exception as error:
+                reply = _failure(error)
+            pipe.send_bytes(reply)
+    if block is not None:
+        block.close()
+
+
+def _failure(error: Exception) -> bytes:
+    """An error as a message; where it does not pickle, one of its name and text."""
+    trace = "".join(traceback.format_exception(type(error), error, error.__traceback__))
+    try:
+        message = pickle.dumps(_Failure(error, trace))
+        pickle.loads(message)
+    except Exception:
+        message = pickle.dumps(_Failure(RuntimeError(f"{type(error).__name__}: {error}"), trace))
+    return message
 
 
 def _restored(arguments: tuple[Any, ...], snapshot: dict[str, Any]) -> WorkerBackend:
@@ -212,54 +305,29 @@ def _restored(arguments: tuple[Any, ...], snapshot: dict[str, Any]) -> WorkerBac
     return backend
 
 
-def _joined(parts: list[Any]) -> Any:
-    """The rows of all blocks, of arrays or of lists."""
-    if isinstance(parts[0], list):
-        return [row for part in parts for row in part]
-    return np.concatenate(parts)
+# Values with a row for each arm: arrays, lists and tuples, dicts of such; and None.
 
 
-# The fields of a state in the order in which they are packed; what diverged and the sensors' noise follow.
-_FIELDS = tuple(field.name for field in fields(SimState))
+def _joined(blocks: list[Any]) -> Any:
+    first = blocks[0]
+    if first is None:
+        return None
+    if isinstance(first, Mapping):
+        return {key: _joined([block[key] for block in blocks]) for key in first}
+    if isinstance(first, np.ndarray):
+        return np.concatenate(blocks)
+    return type(first)(row for block in blocks for row in block)
 
 
-class _Block(gymnasium.Env[Floats, Floats]):
-    """One worker's backend in the form that AsyncVectorEnv runs: its observation is the state, packed row by row.
+def _rows(value: Any, rows: slice) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, Mapping):
+        return {key: _rows(values, rows) for key, values in value.items()}
+    return value[rows]
 
-    Whatever else is asked of the backend goes through reset(), as only reset() and step() use the shared memory.
-    """
 
-    def __init__(self, backend: Backend, index: int, width: int) -> None:
-        self.backend, self._index = backend, index
-        count = backend.num_envs
-        self.observation_space = Box(-np.inf, np.inf, (count, width), np.float64)
-        self.action_space = Box(-np.inf, np.inf, (count, backend.robot.num_joints), np.float64)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Floats, dict[str, Any]]:
-        assert options is not None
-        if options["method"] != "nothing":
-            getattr(self.backend, options["method"])(*(p[self._index] for p in options["parts"]))
-        return self._packed(self.backend.state), self._info()
-
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        return self._packed(self.backend.step(action)), 0.0, False, False, self._info()
-
-    def save(self) -> dict[str, Any]:
-        """The backend's snapshot."""
-        return self.backend.save()
-
-    def _packed(self, state: SimState) -> Floats:
-        count, none = self.backend.num_envs, np.full(self.backend.num_envs, np.nan)
-        diverged, noise = self.backend.diverged, self.backend.sensor_noise
-        columns = [getattr(state, name) for name in _FIELDS]
-        columns += [np.zeros(count) if diverged is None else diverged]
-        columns += [none if noise is None else noise]
-        return np.concatenate([c.reshape(count, -1) for c in columns], axis=1, dtype=np.float64)
-
-    def _info(self) -> dict[str, Any]:
-        return {"report": (self.backend.report(),)}  # in a tuple AsyncVectorEnv leaves it alone
-
-    def close(self) -> None:
-        self.backend.close()
+def _count(value: Any) -> int:
+    while isinstance(value, Mapping):
+        value = next(iter(value.values()))
+    return len(value)

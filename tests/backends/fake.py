@@ -1,4 +1,4 @@
-"""A backend without an engine, for the logic of environments and tasks: joints teleport, a wall stands at 1 rad."""
+"""A backend without an engine, to test environments and tasks: joints teleport, and a wall stands at 1 rad."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from gym_mara.backends import Backend
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
-from tests.helpers import Floats, Mask
+from gym_mara.types import Floats, Mask
 
 
 class FakeBackend(Backend):
     """Collides where the first joint is beyond `wall`, rad."""
+
+    teleports = True
 
     def __init__(
         self,

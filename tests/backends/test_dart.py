@@ -10,13 +10,15 @@ import pytest
 
 from gym_mara.backends import make_backend
 from gym_mara.backends.dart.arm import DETECTORS, DartArm
-from gym_mara.backends.dart.backend import DartBackend, SimulationDivergedError
+from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.collision import make_checker
 from gym_mara.collision.coal import approach_bounds
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.testing import COLLIDING_Q, uniform_q
-from tests.helpers import Floats, robot_model
+from gym_mara.testing import COLLIDING_Q, assert_same_state, pickled, uniform_q
+from gym_mara.types import Floats
+from tests.helpers import robot_model
 
 # In reach without touching anything on the way from home.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
@@ -29,7 +31,8 @@ def _run(backend: DartBackend, target: Floats, steps: int) -> tuple[Floats, Floa
         state = backend.step(target[None])
         assert not state.collided.any()
         positions.append(state.q[0])
-        torques.append(backend.report()["joint_torque"][0])
+        assert state.torque is not None
+        torques.append(state.torque[0])
     return np.array(positions), np.array(torques)
 
 
@@ -190,11 +193,12 @@ def test_another_robot_falls_as_pinocchio_says() -> None:
 def test_contacts_name_the_links_and_their_depth(mara: RobotModel) -> None:
     backend = DartBackend(mara, 1)
     backend.reset(np.array([COLLIDING_Q]))
-    (contacts,) = backend.report()["contacts"]
+    assert backend.state.contacts is not None
+    (contacts,) = backend.state.contacts
     assert contacts
     for contact in contacts:
-        assert frozenset(contact["links"]) in mara.collision_pairs
-        assert 0.0 <= contact["depth"] < 0.5
+        assert "table" in contact.links
+        assert 0.0 <= contact.depth < 0.5
 
 
 def test_looking_only_where_contacts_can_come_about_misses_none(mara: RobotModel) -> None:
@@ -254,31 +258,44 @@ def test_bad_settings_are_refused(mara: RobotModel, settings: dict[str, Any]) ->
         DartBackend(mara, 1, **settings)
 
 
-def _lose(backend: DartBackend, index: int) -> None:
-    """Give an arm a state that no engine can go on from."""
+def _diverge(backend: DartBackend, index: int) -> None:
+    """Give an arm a state from which no engine can continue."""
     arm = backend.arms[index]
     arm.set_state(arm.q, np.full(6, 1e200))
 
 
-def test_a_simulation_that_diverges_is_an_error(mara: RobotModel) -> None:
-    backend = DartBackend(mara, 2)
-    _lose(backend, 1)
-    with pytest.raises(SimulationDivergedError, match="arm 1"):
-        backend.step(np.zeros((2, 6)))
+def test_a_state_that_diverges_is_an_error_from_which_a_reset_recovers(mara: RobotModel) -> None:
+    backend, untouched = DartBackend(mara, 2), DartBackend(mara, 2)
+    _diverge(backend, 1)
+    with pytest.raises(SimulationDivergedError, match=r"arm 1 diverged 0\.020 s after its reset"):
+        backend.step(np.full((2, 6), 0.2))
+    assert backend.state.diverged is None
+    for each in (backend, untouched):
+        each.reset(np.zeros((2, 6)))
+    expected = untouched.step(np.full((2, 6), 0.2))
+    assert_same_state(backend.step(np.full((2, 6), 0.2)), expected)
 
 
-def test_a_simulation_that_diverges_can_be_cut_short(mara: RobotModel) -> None:
+def test_an_arm_whose_state_diverges_is_reported_where_it_was_before(mara: RobotModel) -> None:
     backend = DartBackend(mara, 2, on_divergence="truncate")
-    backend.step(np.full((2, 6), 0.2))
-    before = backend.state
-    _lose(backend, 1)
+    before = backend.step(np.full((2, 6), 0.2))
+    assert before.diverged is not None
+    assert not before.diverged.any()
+    _diverge(backend, 1)
     state = backend.step(np.full((2, 6), 0.2))
-    assert backend.diverged is not None
-    assert backend.diverged.tolist() == [False, True]
-    assert np.isfinite(state.q).all()
-    assert np.isfinite(state.qd).all()
+    assert state.diverged is not None
+    assert state.diverged.tolist() == [False, True]
     np.testing.assert_array_equal(state.q[1], before.q[1])
-    backend.reset(np.zeros((2, 6)), backend.diverged)
+    np.testing.assert_array_equal(state.qd[1], before.qd[1])
+    assert (state.q[0] > before.q[0]).all()
+    snapshot = pickled(backend.save())
+    backend.reset(np.zeros((2, 6)), state.diverged)
+    assert backend.state.diverged is not None
+    assert not backend.state.diverged.any()
     state = backend.step(np.full((2, 6), 0.2))
-    assert backend.diverged is None
+    assert state.diverged is not None
+    assert not state.diverged.any()
     np.testing.assert_array_less(0.0, state.q[1])
+    backend.restore(snapshot)
+    assert backend.state.diverged is not None
+    assert backend.state.diverged.tolist() == [False, True]

@@ -11,7 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from gym_mara.backends.dart.backend import DartBackend, SimulationDivergedError
+from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.testing import COLLIDING_Q, COPIES

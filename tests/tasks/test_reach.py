@@ -18,7 +18,7 @@ from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.rotations import canonical, conjugate, multiply
 from gym_mara.state import SimState
 from gym_mara.tasks import PAPER_TASKS, TASKS, Goal, Observation, ReachTask, Task, named_task
-from gym_mara.testing import arrays_of, uniform_q
+from gym_mara.testing import arms_of, arrays_of, uniform_q
 from gym_mara.types import Floats
 from tests.helpers import (
     TARGET_Q,
@@ -49,10 +49,7 @@ def _state(robot: RobotModel, q: Floats, seed: int | None = None) -> SimState:
 
 
 def _row(state: SimState, row: int) -> SimState:
-    rows: dict[str, Any] = {
-        name: array[row : row + 1] for name, array in arrays_of(state).items() if array is not None
-    }
-    return SimState(**rows)
+    return arms_of(state, slice(row, row + 1))
 
 
 def _goal(task: Task, robot: RobotModel, count: int) -> Goal:

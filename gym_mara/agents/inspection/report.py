@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 from gym_mara.agents.inspection import report_figures as figures
 from gym_mara.agents.inspection.report_figures import Episode
-from gym_mara.agents.inspection.rollout import Player, installed_backends, roll_out
+from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.watch import film_run
 from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder, write_atomically
+from gym_mara.backends import installed_backends
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 

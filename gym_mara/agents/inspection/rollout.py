@@ -11,9 +11,7 @@ import numpy as np
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
-from gym_mara.backends import backend_class, backend_names
 from gym_mara.envs.simulation import Outcome
-from gym_mara.errors import MissingExtraError
 from gym_mara.tasks import MAX_EPISODE_STEPS
 from gym_mara.types import Floats, Mask
 
@@ -124,15 +122,3 @@ def _row(outcome: Outcome) -> tuple[Any, ...]:
         outcome.reward,
         state.collided,
     )
-
-
-def installed_backends() -> tuple[list[str], list[str]]:
-    """The names of the backends whose engines are installed, and for each of the others what is missing."""
-    installed, missing = [], []
-    for name in backend_names():
-        try:
-            backend_class(name)
-            installed.append(name)
-        except MissingExtraError as error:
-            missing.append(str(error))
-    return installed, missing

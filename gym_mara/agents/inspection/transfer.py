@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Player, installed_backends, roll_out
+from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.runs.evaluation import make_env, options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.backends import backend_settings
+from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.types import Floats
 
@@ -58,7 +59,10 @@ def transfer(
     """
     whole_number("episodes", episodes)
     of_env, given = options_beyond_backend(run.config), options or {}
-    settings = {name: backend_settings(name) for name in installed_backends()[0]}
+    installed, reasons = installed_backends()
+    for reason in reasons:
+        warnings.warn(reason, stacklevel=2)
+    settings = {name: backend_settings(name) for name in installed}
     if lost := set(given).difference(*settings.values()):
         raise GymMaraError(
             f"no installed backend knows the setting {min(lost)!r}; "

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from gym_mara.backends.servo import has_diverged
 from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
+from gym_mara.state import Contact
+from gym_mara.types import Floats
 
 with needs("the backend 'dart'", "dart"):
     import dartpy as dart
-
-Floats = NDArray[np.float64]
 
 GRAVITY = 9.81
 """m/s², downwards."""
@@ -29,21 +29,10 @@ DETECTORS = {
     "bullet": "BulletCollisionDetector",
     "ode": "OdeCollisionDetector",
 }
-ABSURD = 1e3
-"""A joint this many times as fast as its limit is no longer simulated."""
 LOOK_AHEAD = 0.01
 """For how long ahead contacts are ruled out at a time, s."""
 # DART wants a mass for every body, also for links that are welded to one that has the mass of both, kg and kg·m².
 _NO_MASS = 1e-9
-
-
-class Contact(NamedTuple):
-    """Two links in touch."""
-
-    links: tuple[str, str]
-    """In alphabetical order."""
-    depth: float
-    """How deep they are in each other at their deepest, m."""
 
 
 class DartArm:
@@ -210,18 +199,18 @@ class DartArm:
         """What the motors exerted in the last physics step (J,), Nm."""
         return np.asarray(self.skeleton.getConstraintForces())
 
-    def run(self, velocities: Floats) -> list[Contact]:
-        """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts at any of them.
+    def run(self, velocities: Floats) -> tuple[Contact, ...]:
+        """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts in any of them.
 
-        Contacts are only looked for in a block of steps in which some could come about. No joint is faster in it than
-        1.25 times its limit: it starts with no more than 1.05, and gravity, should a motor be too weak to hold against
-        it, adds little in a time this short.
+        Contacts are computed only in a block of steps in which links could touch. No joint is faster in it than 1.25
+        times its limit: it starts with at most 1.05 times, and gravity adds little in such a short time, even where a
+        motor is too weak to hold the arm.
         """
         deepest: dict[tuple[str, str], float] = {}
         for start in range(0, len(velocities), self._block):
             block = velocities[start : start + self._block]
             if self.may_touch():
-                if self.lost():
+                if has_diverged(self.q, self.qd, self._speed):
                     break
                 self._run_with_contacts(block, deepest)
             else:
@@ -229,23 +218,19 @@ class DartArm:
                 for velocity in block:
                     command(velocity)
                     step()
-        return [Contact(links, depth) for links, depth in sorted(deepest.items())]
+        return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
 
-    def contacts(self) -> list[Contact]:
-        """What touches now."""
+    def contacts(self) -> tuple[Contact, ...]:
+        """The contacts at the current state."""
         deepest: dict[tuple[str, str], float] = {}
         self._run_with_contacts(np.empty((0, 0)), deepest)
-        return [Contact(links, depth) for links, depth in sorted(deepest.items())]
+        return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
 
     def may_touch(self) -> bool:
         """Whether anything could touch within a block of steps from now."""
         q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
         slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
         return bool(not slow or self._clearance.check(q[None])[0])
-
-    def lost(self) -> bool:
-        """Whether the arm's state has become absurd: not finite, or thrown about by numerical errors."""
-        return bool(is_lost(self.q, self.qd, self._speed))
 
     def _run_with_contacts(self, velocities: Floats, deepest: dict[tuple[str, str], float]) -> None:
         # Detectors remember where shapes have been, and report contacts in an order that hangs on it, with which the
@@ -264,12 +249,6 @@ class DartArm:
         # A step looks for contacts before it moves: those of the last one are still unseen.
         if self.world.checkCollision(self._option, found := dart.collision.CollisionResult()):
             _note(found, deepest)
-
-
-def is_lost(q: Floats, qd: Floats, velocity_limit: Floats) -> NDArray[np.bool_]:
-    """Which arms' states, q and q̇ (..., J), are absurd: not finite, or beyond all limits of velocity (J,)."""
-    sane = np.isfinite(q) & (np.abs(qd) < ABSURD * velocity_limit)
-    return np.logical_not(np.logical_and.reduce(sane, axis=-1))
 
 
 def _world(physics_step: float, detector: str) -> Any:

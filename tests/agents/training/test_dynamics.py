@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,7 @@ def test_a_worker_that_dies_ends_the_training_and_leaves_the_run_to_go_on_with(
 
     def kill(steps: int, shown: dict[str, float]) -> None:
         if steps > ROLLOUT:
-            os.kill(made[0].processes[0].pid, signal.SIGKILL)
+            made[0].processes[0].kill()
 
     monkeypatch.setattr(WorkerBackend, "__init__", remember)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
