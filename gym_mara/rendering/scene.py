@@ -104,7 +104,7 @@ class Scene:
         ]
 
     def bounds(self, view: View, *, moving: bool = True) -> tuple[Floats, Floats]:
-        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts; the target is included."""
+        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts, and of the target."""
         corners = [view.target_position[None].astype(np.float32)]
         for part, placement in zip(self.parts, self.placements(view), strict=True):
             if not part.marker and not (moving and part.fixed):
