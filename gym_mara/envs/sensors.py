@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -59,22 +60,29 @@ class Sensors:
         self._weight = 1.0 - np.exp(-period / filtered) if filtered else 1.0
         self._q = np.zeros((num_envs, robot.num_joints))
         self._qd = np.zeros_like(self._q)
+        # The noise of each arm's episode. A new episode has a new generator, so that it does not depend on how many steps
+        # the last one had: a vector environment also steps arms whose episodes have ended.
+        self._generators: dict[int, np.random.Generator] = {}
 
-    def begin(self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask) -> None:
+    def begin_episodes(self, streams: Sequence[Streams], arms: Mask) -> None:
+        """Seed the noise of the chosen arms (N,) from their random generators."""
+        for arm in np.flatnonzero(arms).tolist():
+            self._generators[arm] = np.random.default_rng(streams[arm].sensors.integers(2**63))
+
+    def begin(self, q: Floats, noise: Floats, arms: Mask) -> None:
         """Take the first measurement of the chosen arms, which are at rest.
 
         Args:
             q: the joint positions (N, J), rad; only the rows of the chosen arms are used.
             noise: the standard deviation of each arm's measured positions (N,), rad.
-            streams: the random generators of each arm.
             arms: the chosen arms (N,).
         """
-        self._q[arms] = self._positions(q, noise, streams, arms)[arms]
+        self._q[arms] = self._positions(q, noise, arms)[arms]
         self._qd[arms] = 0.0
 
-    def measure(self, q: Floats, noise: Floats, streams: Sequence[Streams]) -> None:
+    def measure(self, q: Floats, noise: Floats) -> None:
         """Measure all arms, one period after their last measurement. The arguments are as in `begin`."""
-        measured = self._positions(q, noise, streams, np.ones(len(q), np.bool_))
+        measured = self._positions(q, noise, np.ones(len(q), np.bool_))
         self._qd += self._weight * ((measured - self._q) / self._period - self._qd)
         self._q = measured
 
@@ -92,18 +100,18 @@ class Sensors:
             ee_velocity=self._kinematics.velocity(q, qd),
         )
 
-    def _positions(
-        self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask
-    ) -> Floats:
+    def _positions(self, q: Floats, noise: Floats, arms: Mask) -> Floats:
         measured = q.copy()
         for arm in np.flatnonzero(arms).tolist():
-            measured[arm] += noise[arm] * streams[arm].sensors.standard_normal(q.shape[1])
+            measured[arm] += noise[arm] * self._generators[arm].standard_normal(q.shape[1])
         return measured.clip(self._robot.lower, self._robot.upper)
 
     def save(self) -> dict[str, Any]:
-        """A snapshot of the last measurements."""
-        return {"q": self._q.copy(), "qd": self._qd.copy()}
+        """A snapshot of the last measurements and of the noise."""
+        return copy.deepcopy({"q": self._q, "qd": self._qd, "generators": self._generators})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot."""
-        self._q, self._qd = snapshot["q"].copy(), snapshot["qd"].copy()
+        snapshot = copy.deepcopy(snapshot)
+        self._q, self._qd = snapshot["q"], snapshot["qd"]
+        self._generators = snapshot["generators"]

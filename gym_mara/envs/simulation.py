@@ -73,6 +73,11 @@ class Simulation:
         self.statistics = EpisodeStatistics(self.num_envs)
         self.streams: Sequence[Streams] = ()
         """The random generators of each arm; needed if `random` is true."""
+        if options.sensors.velocity_filter and _sensor_noise(self.backend.state) is None:
+            raise GymMaraError(
+                "velocity_filter smooths the velocity of noisy sensors: "
+                "also give randomisation={'sensor_noise': (lowest, highest)}, or leave it out"
+            )
         self._sensors = self._new_sensors()
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
@@ -113,7 +118,8 @@ class Simulation:
         state = self.backend.state
         noise = _sensor_noise(state)
         if noise is not None:
-            self._sensors.begin(self._start, noise, self.streams, chosen)
+            self._sensors.begin_episodes(self.streams, chosen)
+            self._sensors.begin(self._start, noise, chosen)
         return self._observe(state), _report(state)
 
     def step(self, action: ArrayLike) -> Outcome:
@@ -131,7 +137,7 @@ class Simulation:
         self._began.fill(False)
         noise = _sensor_noise(state)
         if noise is not None:
-            self._sensors.measure(state.q, noise, self.streams)
+            self._sensors.measure(state.q, noise)
         observation = self._observe(state)
         reward, terms = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
@@ -141,7 +147,7 @@ class Simulation:
         elif self.task.on_collision == "reset" and (count := np.count_nonzero(collided)):
             self.backend.reset(self._start, None if count == self.num_envs else collided)
             if noise is not None:
-                self._sensors.begin(self._start, noise, self.streams, collided)
+                self._sensors.begin(self._start, noise, collided)
         distance = terms["distance"] if "distance" in terms else np.full(self.num_envs, np.nan)
         self.statistics.add(distance, reward, collided)
         diverged = state.diverged
@@ -192,7 +198,8 @@ class Simulation:
         self._sensors = self._new_sensors()
         noise = _sensor_noise(backend.state)
         if noise is not None:
-            self._sensors.begin(q, noise, self.streams, everyone)
+            self._sensors.begin_episodes(self.streams, everyone)
+            self._sensors.begin(q, noise, everyone)
 
     def _new_sensors(self) -> Sensors:
         backend = self.backend

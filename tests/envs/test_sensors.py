@@ -24,15 +24,17 @@ def _sensors(robot: RobotModel, velocity_filter: float = 0.0) -> Sensors:
 
 def _measured(robot: RobotModel, velocity_filter: float, speed: float) -> Floats:
     """The measured velocities (T, J), rad/s, of an arm whose joints move at a constant speed, rad/s."""
-    sensors, streams = _sensors(robot, velocity_filter), (Streams.seeded(0),)
+    sensors = _sensors(robot, velocity_filter)
     env = MaraEnv()
     env.reset()
     state = env.simulation.backend.state
     noise, q = np.array([NOISE]), np.full((1, 6), -0.5)
-    sensors.begin(q, noise, streams, np.ones(1, np.bool_))
+    everyone = np.ones(1, np.bool_)
+    sensors.begin_episodes((Streams.seeded(0),), everyone)
+    sensors.begin(q, noise, everyone)
     rows = []
     for step in range(1, 61):
-        sensors.measure(q + speed * PERIOD * step, noise, streams)
+        sensors.measure(q + speed * PERIOD * step, noise)
         rows.append(sensors.seen(state).qd[0])
     return np.array(rows)
 
@@ -131,3 +133,9 @@ def test_a_backend_switch_has_its_own_random_generator() -> None:
         plain.reset(seed=1)
         np.testing.assert_array_equal(after, plain.reset()[1]["mass"])
     np.testing.assert_array_equal(drawn[0], drawn[1])
+
+
+def test_a_filter_without_noise_is_refused() -> None:
+    for options in ({}, {"backend": "dart", "randomisation": {"mass": (0.9, 1.1)}}):
+        with pytest.raises(GymMaraError, match="velocity_filter smooths the velocity of noisy"):
+            MaraEnv(velocity_filter=0.1, **options)  # type: ignore[arg-type]
