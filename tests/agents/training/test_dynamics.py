@@ -104,8 +104,8 @@ def test_transfer_plays_a_policy_on_every_backend(dynamic_run: RunFolder) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"options": {"colour": 1}}, "no backend knows the setting 'colour'"),
+        ({"episodes": 0}, "episodes must be a whole number of at least 1"),
+        ({"options": {"colour": 1}}, "no installed backend knows the setting 'colour'"),
         ({"which": "worst"}, "unknown policy"),
     ],
 )
