@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.types import Floats, Mask
 
 _KNOWN_WRAPPERS = (OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit, Monitor)
 
@@ -58,7 +59,7 @@ class MaraVecEnv(VecEnv):
         self.reward_sum = 0.0
         """The sum of all rewards since it was last set to zero."""
 
-    def reset(self) -> NDArray[np.float64]:
+    def reset(self) -> Floats:
         seeds, self._returns = self._seeds, np.zeros(self.num_envs)
         observation, _ = self.env.reset(seed=seeds if seeds[0] is not None else None)
         self._reset_seeds()
@@ -69,13 +70,13 @@ class MaraVecEnv(VecEnv):
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
-    def targets(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+    def targets(self, actions: NDArray[np.float32]) -> Floats:
         """The joint targets (N, J), rad, of actions (N, J)."""
         return self._target_low + self._span * (np.asarray(actions, np.float64) - self._low)
 
     def step_wait(
         self,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    ) -> tuple[Floats, NDArray[np.float32], Mask, list[dict[str, Any]]]:
         observation, reward, terminated, truncated, info = self.env.step(
             self.targets(self._actions)
         )

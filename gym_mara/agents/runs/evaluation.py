@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -16,6 +15,7 @@ from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import MAX_EPISODE_STEPS
+from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
@@ -41,7 +41,7 @@ def make_env(
 
 def evaluate_run(
     run: RunFolder, *, backend: str | None = None, episodes: int = 10, which: str = "last"
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Floats]:
     """Play episodes with a run's deterministic policy.
 
     Args:
@@ -80,7 +80,7 @@ def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in config.env_options.items() if name not in own}
 
 
-def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, NDArray[np.float64]]:
+def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, Floats]:
     """Play one episode per arm with the deterministic policy; returns METRICS, each (N,)."""
     results: list[dict[str, Any] | None] = [None] * env.num_envs
     observation: Any = env.reset()
@@ -100,7 +100,7 @@ def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, NDArray[np.flo
     return {name: np.array(column, float) for name, column in zip(METRICS, columns, strict=True)}
 
 
-def spread(metrics: dict[str, NDArray[np.float64]]) -> dict[str, dict[str, float]]:
+def spread(metrics: dict[str, Floats]) -> dict[str, dict[str, float]]:
     """Mean, standard deviation, minimum and maximum of each metric over the episodes."""
     return {
         name: {
