@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from gym_mara import cli
+from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.tasks import TASKS
 
 
@@ -21,7 +22,7 @@ class Cli:
         self._monkeypatch, self._capsys = monkeypatch, capsys
 
     def __call__(self, *arguments: object) -> tuple[int, str, str]:
-        """The exit code, and what was printed and complained."""
+        """The exit code, the output and the error output."""
         self._monkeypatch.setattr(sys, "argv", ["gym-mara", *map(str, arguments)])
         with pytest.raises(SystemExit) as exit_:
             cli.main()
@@ -37,12 +38,13 @@ def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     return Cli(monkeypatch, capsys)
 
 
-def test_list_names_everything(gym_mara: Cli) -> None:
+def test_list_shows_everything(gym_mara: Cli) -> None:
     code, out, _ = gym_mara("list")
     assert code == 0
     assert all(f"gym_mara/{task}" in out for task in TASKS)
     assert "pinocchio" in out
     assert "ur5" in out
+    assert all(entry.summary in out for entry in ALGORITHMS.values())
 
 
 @pytest.mark.parametrize(
@@ -60,18 +62,24 @@ def test_list_names_everything(gym_mara: Cli) -> None:
         "list",
     ],
 )
-def test_help_helps(gym_mara: Cli, command: str) -> None:
+def test_every_command_has_help(gym_mara: Cli, command: str) -> None:
     code, out, _ = gym_mara(command, "--help")
     assert code == 0
     assert "Usage" in out
 
 
-def test_a_setting_that_is_meant_to_be_json_must_be(gym_mara: Cli, tmp_path: Path) -> None:
+def test_the_help_comes_from_the_registry(gym_mara: Cli) -> None:
+    _, out, _ = gym_mara("train", "--help")
+    assert f"Algorithm: {', '.join(ALGORITHMS)}." in out
+    assert "Hyperparameters: tuned or paper." in out
+
+
+def test_a_setting_that_looks_like_json_must_be_json(gym_mara: Cli, tmp_path: Path) -> None:
     run = tmp_path / "run"
     code, out, error = gym_mara("train", "--set", "randomisation={'mass': (1, 2)}", "--out", run)
     assert code != 0
     assert "not JSON" in error
-    assert "steps" not in out, "a bar of progress"
+    assert "steps" not in out, "no progress bar"
     assert not run.exists()
 
 
@@ -132,7 +140,7 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
             ["train", "--set", "max_joint_velocity=-1"],
             "max_joint_velocity must be finite and positive",
         ),
-        (["train", "--resume", "nowhere"], "is no run folder"),
+        (["train", "--resume", "nowhere"], "is not a run folder"),
         (["train", "--resume", "nowhere", "--steps", "5", "--algo", "ppo"], "leave out"),
         (["train", "--preset", "papers", "--out", "x"], "unknown preset 'papers'"),
         (["benchmark", "--algos", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
@@ -142,13 +150,13 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
         (["benchmark", "--jobs", "0", "--out", "x"], "--jobs must be"),
         (["plot", "nowhere"], "holds no grid"),
         (["search", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
-        (["evaluate", "nowhere"], "is no run folder"),
+        (["evaluate", "nowhere"], "is not a run folder"),
         (["rewards"], "either --record FILE or --check FILE"),
         (["rewards", "--check", "nowhere.csv"], "cannot read"),
         (["rewards", "--record", "no/such/folder/x.csv"], "cannot write"),
     ],
 )
-def test_bad_input_is_told_in_a_line(
+def test_wrong_input_is_an_error_in_one_line(
     gym_mara: Cli,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -1,1 +1,1 @@
-"""Training and evaluating agents; everything here needs the extra `train`."""
+"""Training and evaluation of agents. All of it but the registry of algorithms needs the extra `train`."""

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's view of a MaraVectorEnv: a native VecEnv, without one Python object per arm."""
+"""A MaraVectorEnv as a VecEnv of Stable-Baselines3, without a Python object for each arm."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.types import Floats, Mask
 
 _KNOWN_WRAPPERS = (OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit, Monitor)
 
 
 class MaraVecEnv(VecEnv):
-    """N arms for Stable-Baselines3, by default with actions in [-1, 1] that span each joint's range.
+    """N arms for Stable-Baselines3; by default actions are in [-1, 1], scaled to each joint's range.
 
-    The info of an arm is empty but at the end of its episode, where it holds `terminal_observation`,
-    `TimeLimit.truncated`, Monitor's `episode`, and what MaraEnv reports at a last step.
+    The info of an arm is empty except at the end of its episode. There it holds `terminal_observation`,
+    `TimeLimit.truncated`, the `episode` of a Monitor, and the info of MaraEnv at the last step.
 
     Args:
-        env: the environment, which must reset in the same step.
-        action_space: the space of the actions (J,), stretched over the environment's own, as `RescaleAction` does.
+        env: the environment, with the autoreset mode SAME_STEP.
+        action_space: the space of the actions (J,), scaled to that of the environment as `RescaleAction` does.
 
     Raises:
-        GymMaraError: the environment's autoreset mode is another.
+        GymMaraError: the environment has another autoreset mode.
     """
 
     def __init__(self, env: MaraVectorEnv, action_space: Box | None = None) -> None:
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise GymMaraError(
-                "Stable-Baselines3 wants episodes reset in the same step: autoreset_mode='SameStep'"
+                "Stable-Baselines3 needs episodes that are reset in the same step: pass autoreset_mode='SameStep'"
             )
         self.env = env
         own = env.simulation.action_space
@@ -58,7 +59,7 @@ class MaraVecEnv(VecEnv):
         self.reward_sum = 0.0
         """The sum of all rewards since it was last set to zero."""
 
-    def reset(self) -> NDArray[np.float64]:
+    def reset(self) -> Floats:
         seeds, self._returns = self._seeds, np.zeros(self.num_envs)
         observation, _ = self.env.reset(seed=seeds if seeds[0] is not None else None)
         self._reset_seeds()
@@ -69,13 +70,13 @@ class MaraVecEnv(VecEnv):
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
-    def targets(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """The joint targets (N, J), rad, that actions (N, J) stand for."""
+    def targets(self, actions: NDArray[np.float32]) -> Floats:
+        """The joint targets (N, J), rad, of actions (N, J)."""
         return self._target_low + self._span * (np.asarray(actions, np.float64) - self._low)
 
     def step_wait(
         self,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    ) -> tuple[Floats, NDArray[np.float32], Mask, list[dict[str, Any]]]:
         observation, reward, terminated, truncated, info = self.env.step(
             self.targets(self._actions)
         )
@@ -137,13 +138,14 @@ class MaraVecEnv(VecEnv):
 
 
 def in_one_batch(arms: VecEnv) -> VecEnv:
-    """The arms of a DummyVecEnv, each an environment of its own, as one MaraVecEnv: alike, at a fraction of the time.
+    """Turn the single environments of a DummyVecEnv into one MaraVecEnv, which steps them in a fraction of the time.
 
-    For what `make_vec_env` makes, and as the `vec_env_wrapper` of RL Baselines3 Zoo. What `RescaleAction` asks for holds
-    on, and a Monitor around the first arm, its file too, is one around the batch. Arms in processes or in a viewer stay as they are.
+    Use it on the result of `make_vec_env`, or as the `vec_env_wrapper` of RL Baselines3 Zoo. The action space of a
+    `RescaleAction` is kept. A Monitor around the first arm, with its file, becomes one around the batch. Environments in
+    processes or in a viewer are returned unchanged.
 
     Raises:
-        GymMaraError: the arms differ, are not made by `gymnasium.make`, or have a wrapper that a batch does not know.
+        GymMaraError: the environments differ, are not made by `gymnasium.make`, or have a wrapper that a batch cannot keep.
     """
     if not isinstance(arms, DummyVecEnv) or arms.render_mode == "human":
         return arms
@@ -151,7 +153,7 @@ def in_one_batch(arms: VecEnv) -> VecEnv:
     first, spec = arms.envs[0], specs[0]
     if spec is None or type(first.unwrapped) is not MaraEnv or len(set(map(repr, specs))) > 1:
         raise GymMaraError(
-            "only arms that are alike, MaraEnv by gymnasium.make, can be put into one batch; not "
+            "a batch needs equal environments, each a MaraEnv made by gymnasium.make, not "
             + ", ".join(sorted({str(env) for env in arms.envs}))
         )
     monitor: Monitor | None = None
@@ -159,8 +161,8 @@ def in_one_batch(arms: VecEnv) -> VecEnv:
     while isinstance(layer, gymnasium.Wrapper):
         if not isinstance(layer, _KNOWN_WRAPPERS):
             raise GymMaraError(
-                f"{type(layer).__name__} wraps a single arm, and cannot be put around a batch; "
-                f"of wrappers it knows {', '.join(sorted(w.__name__ for w in _KNOWN_WRAPPERS))}"
+                f"a batch cannot keep the wrapper {type(layer).__name__}: remove it; "
+                f"allowed are {', '.join(sorted(w.__name__ for w in _KNOWN_WRAPPERS))}"
             )
         monitor = layer if isinstance(layer, Monitor) else monitor
         layer = layer.env
@@ -183,6 +185,6 @@ def in_one_batch(arms: VecEnv) -> VecEnv:
 
 
 def _at(values: dict[str, Any], index: int) -> dict[str, Any]:
-    """One arm's part of a batch of infos, as plain numbers, arrays and objects."""
+    """The info of one arm from a batch of infos, as plain numbers, arrays and objects."""
     own = {k: v[index] for k, v in values.items() if not k.startswith("_")}
     return {k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()}

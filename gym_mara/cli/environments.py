@@ -33,7 +33,7 @@ def list_() -> None:
         table.add_row(entry.name, entry.summary, ", ".join(entry.presets))
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
-    out.print("Robots:", ", ".join(robot_names()), "or the path of a URDF")
+    out.print("Robots:", ", ".join(robot_names()) + ", or the path of a URDF")
     out.print("Modules of an arm:", ", ".join(MODULES))
 
 

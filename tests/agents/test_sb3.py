@@ -1,4 +1,4 @@
-"""The view of the environments that Stable-Baselines3 has."""
+"""The environments as a VecEnv of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def small(num_envs: int = 3, **options: Any) -> MaraVecEnv:
     return make_env("MARAOrient-v0", "pinocchio", num_envs, options, max_episode_steps=4)
 
 
-def test_actions_span_each_joint_s_range() -> None:
+def test_actions_are_scaled_to_each_joint_s_range() -> None:
     env = small()
     env.reset()
     robot = env.env.simulation.robot
@@ -46,7 +46,7 @@ def test_actions_span_each_joint_s_range() -> None:
         )
 
 
-def test_the_last_step_of_an_episode_tells_all() -> None:
+def test_the_info_of_a_last_step_is_complete() -> None:
     env = small()
     start: Any = env.reset()
     rewards = np.zeros(3)
@@ -65,7 +65,7 @@ def test_the_last_step_of_an_episode_tells_all() -> None:
         assert {"position_error", "angle_error", "num_coll", "ep_dist_min"} <= info.keys()
 
 
-def test_a_collision_that_ends_the_episode_is_no_truncation() -> None:
+def test_an_episode_that_a_collision_ends_is_not_truncated() -> None:
     env = small(num_envs=1, on_collision="terminate")
     env.reset()
     _, _, done, infos = step(env, np.array([[0.0, 1.0, 0.5, 0.0, 0.0, 0.0]], np.float32))
@@ -74,7 +74,7 @@ def test_a_collision_that_ends_the_episode_is_no_truncation() -> None:
     assert infos[0]["TimeLimit.truncated"] is False
 
 
-def test_it_goes_on_from_a_snapshot() -> None:
+def test_it_continues_from_a_snapshot() -> None:
     env, action = small(), np.full((3, 6), 0.2, np.float32)
     env.reset()
     step(env, action)
@@ -97,7 +97,7 @@ def test_any_algorithm_of_stable_baselines3_trains_on_it() -> None:
     assert model.ep_info_buffer[0]["l"] == 4
 
 
-def test_it_wants_episodes_reset_in_the_same_step() -> None:
+def test_another_autoreset_mode_is_refused() -> None:
     with pytest.raises(GymMaraError, match="SameStep"):
         MaraVecEnv(MaraVectorEnv(2))
 
@@ -107,7 +107,9 @@ GENTLE = "gym_mara/MARACollision-v0"
 
 @pytest.mark.parametrize("env_id", ["gym_mara/MARA-v0", "gym_mara/MARARandomTarget-v0"])
 @pytest.mark.parametrize("options", [{}, {"on_collision": "terminate"}])
-def test_arms_in_one_batch_are_those_that_were_apart(env_id: str, options: dict[str, Any]) -> None:
+def test_a_batch_gives_the_same_results_as_single_environments(
+    env_id: str, options: dict[str, Any]
+) -> None:
     def arms() -> VecEnv:
         return make_vec_env(
             env_id,
@@ -117,14 +119,14 @@ def test_arms_in_one_batch_are_those_that_were_apart(env_id: str, options: dict[
             wrapper_class=rescaled,
         )
 
-    apart, together = arms(), in_one_batch(arms())
-    assert isinstance(together.unwrapped, MaraVecEnv)
-    assert together.action_space == apart.action_space
-    np.testing.assert_array_equal(together.reset(), apart.reset())
+    single, batch = arms(), in_one_batch(arms())
+    assert isinstance(batch.unwrapped, MaraVecEnv)
+    assert batch.action_space == single.action_space
+    np.testing.assert_array_equal(batch.reset(), single.reset())
     rng, ends = np.random.default_rng(0), 0
     for _ in range(13):
         action = rng.uniform(-0.5, 1.5, (5, 6)).astype(np.float32)
-        mine, theirs = step(together, action), step(apart, action)
+        mine, theirs = step(batch, action), step(single, action)
         for one, other in zip(mine[:3], theirs[:3], strict=True):
             np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-6)
         for info, expected in zip(mine[3], theirs[3], strict=True):
@@ -138,7 +140,7 @@ def test_arms_in_one_batch_are_those_that_were_apart(env_id: str, options: dict[
 
 
 def rescaled(env: Any) -> RescaleAction[Any, Any, Any]:
-    """Actions in a range of one's own."""
+    """An environment with actions in [-0.5, 1.5]."""
     return RescaleAction(env, np.float32(-0.5), np.float32(1.5))
 
 
@@ -156,7 +158,7 @@ def test_the_batch_writes_the_monitor_s_file(tmp_path: Path) -> None:
     assert [line.split(",")[1] for line in lines[2:]] == ["4"] * 4
 
 
-def test_arms_in_processes_or_in_a_viewer_stay_as_they_are() -> None:
+def test_environments_that_cannot_be_batched_are_returned_unchanged() -> None:
     watched = make_vec_env("gym_mara/MARA-v0", 1, env_kwargs={"render_mode": "human"})
     assert in_one_batch(watched) is watched
     batch = small()
@@ -168,18 +170,18 @@ def test_arms_in_processes_or_in_a_viewer_stay_as_they_are() -> None:
     [
         (
             [lambda: gymnasium.make("gym_mara/MARA-v0"), lambda: gymnasium.make(GENTLE)],
-            r"only arms that are alike, MaraEnv by gymnasium.make.*not <.*MARA-v0.*MARACollision-v0",
+            r"a batch needs equal environments.*not <.*MARA-v0.*MARACollision-v0",
         ),
-        ([lambda: gymnasium.make("Pendulum-v1")], "only arms that are alike.*PendulumEnv"),
-        ([lambda: gymnasium.make("gym_mara/MARAGoal-v0")], "only arms that are alike"),
-        ([MaraEnv], "only arms that are alike"),
+        ([lambda: gymnasium.make("Pendulum-v1")], "a batch needs equal environments.*PendulumEnv"),
+        ([lambda: gymnasium.make("gym_mara/MARAGoal-v0")], "a batch needs equal environments"),
+        ([MaraEnv], "a batch needs equal environments"),
         (
             [lambda: NormalizeObservation(gymnasium.make("gym_mara/MARA-v0"))],
-            "NormalizeObservation wraps a single arm.*it knows Monitor, OrderEnforcing, Pass",
+            "cannot keep the wrapper NormalizeObservation.*allowed are Monitor, OrderEnforcing, Pass",
         ),
     ],
 )
-def test_arms_that_do_not_go_into_one_batch(make: list[Any], message: str) -> None:
+def test_environments_that_do_not_form_a_batch_are_an_error(make: list[Any], message: str) -> None:
     with pytest.raises(GymMaraError, match=message):
         in_one_batch(DummyVecEnv(make))
 

@@ -1,1 +1,1 @@
-"""The algorithms: what each is called, its class, its presets and its search space; and those that are ours."""
+"""The registry of algorithms, with their presets and search spaces; and the algorithms of this package."""

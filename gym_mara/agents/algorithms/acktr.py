@@ -1,4 +1,4 @@
-"""ACKTR for Stable-Baselines3: an actor and a critic that learn by natural gradients in a trust region, through K-FAC."""
+"""ACKTR for Stable-Baselines3: actor and critic learn with natural gradients from K-FAC, within trust regions."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from gym_mara.agents.algorithms.kfac import KFAC
 from gym_mara.errors import GymMaraError
 
 LEAST_STD = 1e-5
-"""Standard deviations stay above this: actions are float32 of order 1, and much below it cannot tell them apart.
+"""The lower bound of standard deviations. Actions are float32 of order 1, and cannot resolve much smaller ones.
 
-`natural_gaussian` goes down to a tenth of it. Tuned trainings come down to either, so that another value is another result.
+`natural_gaussian` has a bound ten times smaller. Trainings with tuned presets reach either bound, so another value would
+change their results.
 """
 # The Fisher information of a Gaussian's log standard deviation: E[(∂ log p / ∂ log σ)²].
 _FISHER_OF_LOG_STD = 2.0
@@ -36,28 +37,29 @@ _FISHER_OF_LOG_STD = 2.0
 class ACKTR(OnPolicyAlgorithm):
     """Actor-critic using Kronecker-factored trust region (Wu et al. 2017, arXiv 1708.05144).
 
-    Each rollout makes one update. Actor and critic are networks of their own, each with its own K-FAC optimiser and trust
-    region. The critic predicts a Gaussian, its variance the mean square of the differences between returns and values.
+    There is one update per rollout. Actor and critic are separate networks, each with its own K-FAC optimiser and trust region.
+    The critic predicts a Gaussian, whose variance is the mean square of the differences between returns and values.
 
     Args:
-        policy: "MlpPolicy", "MultiInputPolicy", or a class of actor and critic made of linear layers.
+        policy: "MlpPolicy", "MultiInputPolicy", or an actor-critic class with linear layers only.
         env: the environment, or its id.
-        learning_rate: η, the longest step along the natural gradient; a number, or a function of the remaining progress.
+        learning_rate: η, the largest factor of a step along the natural gradient; a number or a function of the remaining
+            progress.
         n_steps: steps of each environment in a rollout.
         gamma: discount.
-        gae_lambda: λ of the generalised advantages; 1 for the returns themselves.
+        gae_lambda: λ of generalised advantage estimation; with 1 the advantages come from the returns.
         ent_coef: weight of the policy's entropy.
         vf_coef: the critic's learning rate relative to the actor's.
-        max_grad_norm: of the gradient in the cold updates.
-        target_kl: how far an update may move the policy, as a KL divergence.
+        max_grad_norm: the largest norm of the gradient in the cold updates.
+        target_kl: the largest KL divergence between the policies before and after an update.
         critic_kl: the same for the critic.
         damping, fisher_decay, momentum, cold_updates: of the K-FAC optimisers; see `gym_mara.agents.algorithms.kfac.KFAC`.
-        normalize_advantage: whether a rollout's advantages are scaled to mean 0 and variance 1.
+        normalize_advantage: whether the advantages of a rollout are scaled to mean 0 and variance 1.
         rollout_buffer_class, rollout_buffer_kwargs, stats_window_size, tensorboard_log, policy_kwargs, verbose, seed,
-            device: as in every algorithm of Stable-Baselines3.
+            device: as in all algorithms of Stable-Baselines3.
 
     Raises:
-        GymMaraError: the policy has parameters that are neither a linear layer's nor the log standard deviation.
+        GymMaraError: the policy has parameters other than those of linear layers and the log standard deviation.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -139,7 +141,7 @@ class ACKTR(OnPolicyAlgorithm):
         for name, parameter in self.policy.named_parameters():
             if parameter not in known:
                 raise GymMaraError(
-                    f"ACKTR knows policies made of linear layers, and this one has {name!r}: use MlpPolicy"
+                    f"ACKTR needs a policy of linear layers only, but this one also has {name!r}: use MlpPolicy"
                 )
         settings: dict[str, Any] = {
             "lr": self.lr_schedule(1.0),
@@ -161,7 +163,7 @@ class ACKTR(OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train for so many more steps; as in every algorithm of Stable-Baselines3."""
+        """Train for this many more steps; see Stable-Baselines3."""
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
         )
@@ -192,7 +194,7 @@ class ACKTR(OnPolicyAlgorithm):
     def _update_actor(self, observations: Tensor, actions: Tensor, advantages: Tensor) -> None:
         optimizer = self.actor_optimizer
         with optimizer.watch():
-            # A copy: the policy keeps one distribution and changes it.
+            # A copy, because the policy reuses one distribution object.
             distribution = copy.copy(self.policy.get_distribution(observations))
         with torch.no_grad():
             drawn = distribution.sample()
@@ -217,7 +219,7 @@ class ACKTR(OnPolicyAlgorithm):
         with optimizer.watch():
             values = self.policy.predict_values(observations).flatten()
         old = values.detach()
-        # Around the values, not around the mean difference: an offset is an error as well.
+        # The mean square, not the variance around the mean difference, because a constant offset is an error too.
         variance = (returns - old).square().mean() + 1e-8
         drawn = old + variance.sqrt() * torch.randn_like(old)
         optimizer.observe(0.5 * (drawn - values).square() / variance)
@@ -246,5 +248,5 @@ def _linear(module: nn.Module) -> list[nn.Linear]:
 
 def _entropy(distribution: Distribution) -> Tensor:
     entropy = distribution.entropy()
-    assert entropy is not None  # of a Gaussian and of a categorical distribution it is known
+    assert entropy is not None  # it exists for Gaussian and categorical distributions
     return entropy

@@ -1,9 +1,9 @@
-"""K-FAC: natural-gradient steps from a Kronecker-factored Fisher matrix, each within a trust region.
+"""K-FAC: natural-gradient steps with a Kronecker-factored Fisher matrix, each within a trust region.
 
-For a linear layer y = W̄ā with ā = [a, 1] and g = -∂ log p / ∂y, the layer's block of the Fisher matrix is taken as
-G ⊗ A, A = E[ā āᵀ] and G = E[g gᵀ], the expectations over what the model itself predicts (Martens and Grosse 2015,
-"Optimizing neural networks with Kronecker-factored approximate curvature"). Two small matrices are inverted, and not one
-that is as wide as the layer has weights.
+For a linear layer y = W̄ā with ā = [a, 1] and g = -∂ log p / ∂y, the layer's block of the Fisher matrix is approximated by
+G ⊗ A with A = E[ā āᵀ] and G = E[g gᵀ]. The expectations are over the model's own predictions (Martens and Grosse 2015,
+"Optimizing neural networks with Kronecker-factored approximate curvature"). This needs the inverses of two small
+matrices, not of one with a row for each weight of the layer.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from torch import Tensor, nn
 
 from gym_mara.errors import TrainingDivergedError
 
-# How often a step is shortened until the model has moved no further than the trust region.
+# A step is shortened at most this often until it is within the trust region.
 _ATTEMPTS = 10
 _LEAST_DAMPING = 1e-5
-_ADVICE = "look for rewards or observations that are not, or learn more slowly"
+_ADVICE = "look for rewards or observations that are not finite, or use a smaller learning rate"
 
 
 class KFAC(torch.optim.Optimizer):
     """Natural-gradient descent for a network of linear layers (Wu et al. 2017, "ACKTR").
 
-    An update: inside `watch()` run the model; give `observe` the loss of outputs that the model itself has drawn; put the
-    gradients into place with `backward()`; then `step`.
+    One update: run the model inside `watch()`; pass `observe` the negative log-likelihood of outputs sampled from the model;
+    compute the gradients with `backward()`; then call `step`.
 
     Args:
         layers: the network's linear layers.
-        exact: other parameters, each with the diagonal of its Fisher matrix, where that is known and constant.
-        lr: the learning rate η: a step is -η F⁻¹∇L, where that is within the trust region.
-        trust_region: how far a step may move the model's predictions, as a KL divergence.
-        damping: λ, split over the two factors: A + π√λ 1 and G + √λ/π 1, with π² the ratio of their mean eigenvalues
+        exact: other parameters, each with the diagonal of its Fisher matrix, which is known and constant.
+        lr: the learning rate η; a step is -η F⁻¹∇L, shortened to the trust region.
+        trust_region: the largest KL divergence between the model's predictions before and after a step.
+        damping: λ, split between the two factors: A + π√λ 1 and G + √λ/π 1, where π² is the ratio of their mean eigenvalues
             (factored Tikhonov; Martens and Grosse 2015, section 6.3).
         decay: of the factors' running averages.
         momentum: of the natural gradients' running average.
-        cold_updates: so many first updates are plain gradient descent, until the factors are worth inverting.
-        max_grad_norm: of the gradients in those.
+        cold_updates: the number of first updates that use plain gradient descent, until the factors are good enough.
+        max_grad_norm: the largest norm of the gradient in these updates.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class KFAC(torch.optim.Optimizer):
         self._seen: dict[nn.Module, tuple[Tensor, Tensor]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything, where torch's optimisers would leave out what is not theirs."""
+        """All attributes; torch's own method would leave out those of this class."""
         return dict(vars(self))
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        """Note what goes into the layers and comes out of them."""
+        """Keep the inputs and outputs of the layers while the model runs."""
 
         def note(layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
             self._seen[layer] = inputs[0].detach(), output
@@ -87,13 +87,13 @@ class KFAC(torch.optim.Optimizer):
                 hook.remove()
 
     def observe(self, loss: Tensor) -> None:
-        """Take up the Fisher factors of the model as watched.
+        """Update the Fisher factors with the run that was watched.
 
         Args:
-            loss: -log p of an output that the model has drawn, for each example (N,).
+            loss: -log p of an output sampled from the model, for each example (N,).
 
         Raises:
-            TrainingDivergedError: a loss is not finite; the factors have not changed then.
+            TrainingDivergedError: a loss is not finite. The factors are then unchanged.
         """
         if not loss.isfinite().all():
             raise TrainingDivergedError(f"the model's predictions are not finite: {_ADVICE}")
@@ -104,7 +104,7 @@ class KFAC(torch.optim.Optimizer):
             if layer.bias is not None:
                 a = torch.cat([a, a.new_ones(len(a), 1)], dim=1)
             state = self.state[layer.weight]
-            # A plain mean at first, so that the first examples do not count for more than the later ones.
+            # A plain mean at first, so that the first examples do not have more weight than later ones.
             weight = max(1.0 - self.decay, 1.0 / (group["updates"] + 1))
             for name, rows in (("A", a), ("G", g)):
                 factor = rows.T @ rows / len(rows)
@@ -113,17 +113,17 @@ class KFAC(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float:  # type: ignore[override]
-        """Change the parameters by their gradients, as far as the trust region allows.
+        """Change the parameters according to their gradients, within the trust region.
 
         Args:
-            closure: how far the model now stands from where it stood before the step, as a KL divergence; without it the
-                Kronecker factors' own estimate is relied on.
+            closure: computes the KL divergence between the model before the step and now; without it the estimate from
+                the Kronecker factors is used.
 
         Returns:
-            How far the model has moved, as a KL divergence.
+            The KL divergence of the step.
 
         Raises:
-            TrainingDivergedError: a gradient, a factor or the step is not finite; no parameter has changed then.
+            TrainingDivergedError: a gradient, a factor or the step is not finite. No parameter has changed then.
         """
         gradients = [self._gradient(group) for group in self.param_groups]
         if not all(gradient.isfinite().all() for gradient in gradients):
@@ -145,14 +145,14 @@ class KFAC(torch.optim.Optimizer):
         return self._move(steps, closure)
 
     def _gradient(self, group: dict[str, Any]) -> Tensor:
-        """A layer's gradient as a matrix, the bias its last column; or that of another parameter as it is."""
+        """A layer's gradient as a matrix with the bias as its last column; the gradient of another parameter unchanged."""
         gradients = [parameter.grad for parameter in group["params"]]
         if len(gradients) == 1:
             return gradients[0]
         return torch.cat([gradients[0], gradients[1][:, None]], dim=1)
 
     def natural_gradient(self, group: dict[str, Any], gradient: Tensor) -> Tensor:
-        """F⁻¹∇L of one group of parameters, with the damped Fisher matrix F.
+        """F⁻¹∇L of one group of parameters, where F is the damped Fisher matrix.
 
         Raises:
             TrainingDivergedError: a factor of F is not finite.
@@ -164,16 +164,16 @@ class KFAC(torch.optim.Optimizer):
         mean_a, mean_g = float(a.diagonal().mean()), float(g.diagonal().mean())
         if not math.isfinite(mean_a * mean_g):
             raise TrainingDivergedError(f"the Fisher factors are not finite: {_ADVICE}")
-        # Of each factor's mean eigenvalue; rounding leaves the factors' smallest ones unknown to some 1e-6 of it.
+        # Relative to each factor's mean eigenvalue; rounding errors of the smallest eigenvalues are about 1e-6 of it.
         relative = max(math.sqrt(self.damping / max(mean_a * mean_g, 1e-30)), _LEAST_DAMPING)
-        # Where nothing flows, as through dead units, a factor is zero.
+        # The factors of units that are always zero are zero themselves; they are then damped with 1.
         a.diagonal().add_(relative * mean_a or 1.0)
         g.diagonal().add_(relative * mean_g or 1.0)
         left = torch.cholesky_solve(gradient.double(), torch.linalg.cholesky(g))
         return torch.cholesky_solve(left.T, torch.linalg.cholesky(a)).T.to(gradient.dtype)
 
     def divergence(self, steps: list[Tensor]) -> float:
-        """The Fisher matrix's estimate, ½ ΔᵀFΔ, of how far steps Δ, one a group, move the model."""
+        """The KL divergence of steps Δ, one for each group, estimated as ½ ΔᵀFΔ."""
         total = 0.0
         for group, step in zip(self.param_groups, steps, strict=True):
             if "fisher" in group:
@@ -181,10 +181,10 @@ class KFAC(torch.optim.Optimizer):
             else:
                 state = self.state[group["params"][0]]
                 total += float(((state["G"] @ step @ state["A"]) * step).sum())
-        return max(0.5 * total, 0.0)  # rounding can bring it below
+        return max(0.5 * total, 0.0)  # rounding errors can make it negative
 
     def _move(self, steps: list[Tensor], closure: Callable[[], float] | None) -> float:
-        """Make the steps, shortened as often as it takes."""
+        """Make the steps, shortened until they are within the trust region; the KL divergence, 0 if none is."""
         origin = [[p.clone() for p in group["params"]] for group in self.param_groups]
         expected = self.divergence(steps)
         if not math.isfinite(expected):
@@ -198,7 +198,7 @@ class KFAC(torch.optim.Optimizer):
                 moved = closure()
                 if moved <= self.trust_region:
                     return moved
-                # The divergence grows with the square of a small step.
+                # For small steps the divergence is proportional to the square of the step.
                 scale *= 0.95 * math.sqrt(self.trust_region / moved) if moved < math.inf else 0.1
         except BaseException:
             self._put_back(origin)

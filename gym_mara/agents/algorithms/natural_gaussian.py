@@ -1,11 +1,11 @@
-"""A Gaussian policy with a full covariance, learnt in its own natural coordinates.
+"""A Gaussian policy with a full covariance, learnt in natural coordinates.
 
-Near a target some directions of joint space move the tool and others only turn it: the reward tells a tenth of a
-millimetre of the first, and hardly a degree of the second. Independent noise on each joint cannot be narrow in the
-first and wide in the second; a full covariance can. But an optimiser such as Adam, which weighs joint against joint,
-then loses what little it hears from the wide directions in the noise of the narrow ones. So everything is learnt
-relative to the present distribution, where all directions look alike (natural coordinates; Glasmachers et al. 2010,
-"Exponential natural evolution strategies").
+Near a target some directions in joint space move the tool, and others only rotate it. The reward changes with a tenth of a
+millimetre in the former, but hardly with a degree in the latter. So the policy's noise should be narrow in the former and
+wide in the latter. Independent noise for each joint cannot be; noise with a full covariance can. But then an optimiser
+such as Adam, which scales the gradient joint by joint, mixes the two: the weak signal of the wide directions disappears
+in the noise of the narrow ones. Therefore everything is learnt relative to the current distribution, in which all
+directions have the same width (natural coordinates; Glasmachers et al. 2010, "Exponential natural evolution strategies").
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from torch.distributions import MultivariateNormal
 
 from gym_mara.errors import GymMaraError
 
-# Standard deviations stay above this: much below it actions, which are float32 of order 1, no longer tell them apart.
-# ACKTR stops at ten times that. Tuned trainings come down to either, so that another value is another result.
+# The lower bound of standard deviations. Actions are float32 of order 1, and cannot resolve much smaller ones. The bound in
+# `acktr` is ten times larger. Trainings with tuned presets reach either bound, so another value would change their results.
 LEAST_STD = 1e-6
-# The widening makes none wider than this, five times an action's range. It is there against overflow: where the reward
-# says nothing, as of the last joint without orientation, tuned trainings reach some four.
+# `widening` makes no standard deviation larger than this, five times the range of an action. It prevents an overflow. If the
+# reward does not depend on a joint, such as the last one in tasks without orientation, tuned trainings reach about 4.
 WIDEST_STD = 10.0
 
 
 class NaturalGaussian(Distribution):
-    """a = c + F e^S (m + ε), ε ~ N(0, 1): a Gaussian with mean c + F e^S m and covariance F e^2S Fᵀ.
+    """a = c + F e^S (m + ε) with ε ~ N(0, 1): a Gaussian with mean c + F e^S m and covariance F e^2S Fᵀ.
 
     The mean m (N, A) and the symmetric S (A, A) are relative to the centre c (A,) and the factor F (A, A).
     """
@@ -59,7 +59,7 @@ class NaturalGaussian(Distribution):
 
     @property
     def distribution(self) -> MultivariateNormal:  # type: ignore[override]
-        """The same as torch has it, of F⁻¹(a - c): divergences from others with this c and F are alike in both."""
+        """The distribution of F⁻¹(a - c) in torch's form; its divergence from others with the same c and F is that of a."""
         return MultivariateNormal(
             self.mean @ torch.matrix_exp(self.log_scale).T,
             torch.matrix_exp(2.0 * self.log_scale),
@@ -85,27 +85,27 @@ class NaturalGaussian(Distribution):
 
 
 class NaturalGaussianPolicy(ActorCriticPolicy):
-    """Stable-Baselines3's actor and critic with a NaturalGaussian, for box actions.
+    """The ActorCriticPolicy of Stable-Baselines3 with a NaturalGaussian, for box actions.
 
-    Before each update the centre moves to the mean of the rollout's means and the factor takes up what was learnt of the
-    covariance. Without `widening` this does not change the policy. With it the policy, means and spread, is also scaled
-    about its old centre, so that the rollout was drawn from a narrower one, and the first ratios of an update differ from
-    one by some hundredths.
+    Before each update, the centre moves to the average of the rollout's means, and the factor absorbs the learnt change of the
+    covariance. Without `widening` this does not change the policy. With it, the policy's means and spread are also scaled
+    about the old centre. The rollout then comes from a narrower distribution, and the first probability ratios of an
+    update differ from 1 by a few hundredths.
 
-    The optimiser is plain gradient descent, torch's SGD: in these coordinates the plain gradient is the natural one. It
-    wants learning rates of 0.005 to 0.1. An optimiser that gives every parameter steps of one size, such as Adam, makes
-    noise of the gradient.
+    The optimiser is plain gradient descent, torch's SGD, because in these coordinates the plain gradient is the natural
+    gradient. It needs learning rates of 0.005 to 0.1. An optimiser with steps of the same size for all parameters, such as
+    Adam, amplifies the noise of the gradient.
 
     Args:
-        *args, **kwargs: as of ActorCriticPolicy.
+        *args, **kwargs: as for ActorCriticPolicy.
         covariance_rate: how fast the covariance is learnt, relative to the mean.
-        bias_rate: how fast what is common to the means of all states is learnt, relative to how they differ.
-        widening: an entropy bonus, for algorithms that have none as well. Where an update has narrowed the distribution
-            by e^-x in the direction that it narrowed most, the distribution is widened by e^(widening x) in all. So
-            directions of which the reward says little stay wide. None becomes wider by it than a standard deviation of 10.
+        bias_rate: how fast the part of the mean that all states share is learnt, relative to the part that differs.
+        widening: an entropy bonus that works with every algorithm. If an update narrowed the distribution by e^-x in the
+            direction that it narrowed most, the distribution is widened by e^(widening x) in all directions. Thus
+            directions that hardly affect the reward stay wide. It widens no standard deviation beyond 10.
 
     Raises:
-        GymMaraError: the actions are no box, or gSDE is asked for.
+        GymMaraError: the actions are not a box, or gSDE is requested.
     """
 
     centre: Tensor
@@ -134,7 +134,7 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         if not isinstance(self.action_space, spaces.Box) or self.use_sde:
-            raise GymMaraError("NaturalGaussianPolicy wants box actions, and use_sde=False")
+            raise GymMaraError("NaturalGaussianPolicy needs box actions and use_sde=False")
         super()._build(lr_schedule)
         size = self.action_net.out_features
         del self.log_std
@@ -142,7 +142,7 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         self.log_scale = nn.Parameter(torch.zeros(size, size))
         self.register_buffer("centre", torch.zeros(size))
         self.register_buffer("factor", torch.eye(size) * math.exp(self.log_std_init))
-        # The means of the rollout's states; of no use once it has ended.
+        # The sum of the means in the rollout; not needed after the update, so not stored.
         self.register_buffer("_mean_sum", torch.zeros(size), persistent=False)
         self._count = 0
         self.optimizer = self.optimizer_class(
@@ -161,26 +161,26 @@ class NaturalGaussianPolicy(ActorCriticPolicy):
         return 0.5 * self.covariance_rate * (self.log_scale + self.log_scale.T)
 
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Act in a rollout: actions, values and log-probabilities."""
+        """Actions, values and log-probabilities for the states of a rollout."""
         result = super().forward(obs, deterministic)
         mean = self.action_dist.mean.detach()
         self._mean_sum, self._count = self._mean_sum + mean.sum(dim=0), self._count + len(mean)
         return result
 
     def set_training_mode(self, mode: bool) -> None:
-        """Called before an update (True) and whenever the policy is only to act (False)."""
+        """Stable-Baselines3 calls it with True before an update, and with False before the policy only acts."""
         if mode and self._count:
             self.recentre()
         super().set_training_mode(mode)
 
     @torch.no_grad()
     def recentre(self) -> None:
-        """Make the present distribution the one that everything is relative to."""
+        """Make the current distribution the reference of the coordinates."""
         mean = self._mean_sum / self._count
         learnt = self._symmetric_log_scale()
         narrowed = -torch.linalg.eigvalsh(learnt).min().clamp(max=0.0)
         left, sizes, right = torch.linalg.svd(self.factor @ torch.matrix_exp(learnt))
-        # Estimates that are noise narrow something at every update: what widens must end somewhere.
+        # Noise in the estimates narrows some direction in every update, so the widening needs an upper bound.
         widened = (sizes * torch.exp(self.widening * narrowed)).clamp(max=WIDEST_STD)
         sizes = torch.maximum(sizes, widened).clamp(min=LEAST_STD)
         self.factor.copy_(left @ torch.diag(sizes) @ right)

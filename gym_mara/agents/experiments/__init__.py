@@ -1,1 +1,1 @@
-"""Many runs: grids of trainings, searches for hyperparameters, figures, and what runs them in parallel."""
+"""Many runs: grids, searches for hyperparameters, figures, and the executors that run them in parallel."""

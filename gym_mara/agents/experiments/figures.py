@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from gym_mara.agents.experiments.grid import Grid, read_grid, read_result
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
+from gym_mara.types import Floats
 
 # Column of the table → where a result holds its value, and how many digits are printed.
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
@@ -140,8 +140,8 @@ def _draw(
 
 def _draw_band(
     axis: Axes,
-    steps: NDArray[np.float64],
-    lines: NDArray[np.float64],
+    steps: Floats,
+    lines: Floats,
     algo: str,
     colour: str,
     alone: bool,
@@ -157,9 +157,7 @@ def _draw_band(
             axis.plot(steps, line, color=colour, linewidth=0.5, alpha=0.6)
 
 
-def _episode_reward(
-    rows: list[dict[str, float]], steps: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _episode_reward(rows: list[dict[str, float]], steps: Floats) -> Floats:
     """The reward of a whole episode at these numbers of steps, from the mean reward per step since the number before."""
     points = [(r["time/total_timesteps"], r[_TRAINING]) for r in rows if _TRAINING in r]
     x, y = (np.array(column) for column in zip(*points, strict=True))
@@ -167,7 +165,7 @@ def _episode_reward(
     count = np.bincount(part, minlength=len(steps))
     mean = np.bincount(part, y, len(steps)) / np.maximum(count, 1)
     there = count > 0
-    filled: NDArray[np.float64] = np.interp(steps, steps[there], mean[there])
+    filled: Floats = np.interp(steps, steps[there], mean[there])
     return MAX_EPISODE_STEPS * filled
 
 

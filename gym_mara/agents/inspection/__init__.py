@@ -1,1 +1,1 @@
-"""What a policy does: recorded, watched, filmed, compared across backends, reported."""
+"""Looks at a policy: trajectories, the viewer, films, a comparison of backends, and reports."""

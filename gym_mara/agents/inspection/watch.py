@@ -1,4 +1,4 @@
-"""Watching a policy: in a film, one backend beside the other, or live in the browser."""
+"""Shows a policy: in a film, one backend beside the other, or live in the viewer."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ def film_run(
     speed: float = 1.0,
     rate: float = HIGHEST_RATE,
 ) -> None:
-    """Film the beginning of an episode that a run's policy plays, on each backend, side by side.
+    """Film the start of an episode of a run's policy on each backend, side by side.
 
     Args:
         run: the run.
         path: a new file, .mp4 or .gif.
         backends: the backends.
-        options: keyword arguments of the environment beside the run's own, and of the pictures.
+        options: keyword arguments of the environment, in addition to those of the run.
         which: the policy, "last" or "best".
-        seconds: how much of the episode, s.
-        speed: how much faster than real time.
-        rate: how many pictures a second the film has at most.
+        seconds: length of the filmed part of the episode, s.
+        speed: times real time.
+        rate: highest number of pictures per second.
 
     Raises:
         GymMaraError: the file exists or cannot be written, the policy is missing or damaged, or a value is out of its range.
     """
-    check_film_path(path)  # before anything takes time
+    check_film_path(path)  # an error comes before the policy is played
     with ExitStack() as stack:
         players = []
         for backend in backends:

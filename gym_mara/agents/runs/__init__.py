@@ -1,1 +1,1 @@
-"""A run on disk: its folder, its policy, and how good it is."""
+"""Run folders: their files, the policies in them, and the evaluation of those."""

@@ -1,11 +1,10 @@
-"""Evaluating a policy: how near it brings the tool, over whole episodes."""
+"""Evaluates a policy over whole episodes: position error, angle, rewards and collisions."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -16,6 +15,7 @@ from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import MAX_EPISODE_STEPS
+from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
@@ -41,17 +41,17 @@ def make_env(
 
 def evaluate_run(
     run: RunFolder, *, backend: str | None = None, episodes: int = 10, which: str = "last"
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Floats]:
     """Play episodes with a run's deterministic policy.
 
     Args:
         run: the run.
-        backend: the backend to play on; by default the one it was trained on.
-        episodes: how many.
+        backend: the backend to play on; by default the one that the run was trained on.
+        episodes: the number of episodes.
         which: the policy, "last" or "best".
 
     Returns:
-        Each of METRICS per episode (episodes,): position and angle at the last step.
+        Each of METRICS per episode (episodes,); position error and angle are those of the last step.
 
     Raises:
         GymMaraError: the policy is missing, damaged, or of another environment; episodes is below 1.
@@ -70,18 +70,18 @@ def evaluate_run(
 
 
 def options_on(backend: str, config: RunConfig) -> dict[str, Any]:
-    """The keyword arguments of a run's environment, on another backend those that mean something there."""
+    """The keyword arguments of a run's environment; on another backend without the settings of the run's own."""
     return config.env_options if backend == config.backend else options_beyond_backend(config)
 
 
 def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
-    """The keyword arguments of a run's environment that mean something on any backend."""
+    """The keyword arguments of a run's environment, without the settings of its backend."""
     own = backend_settings(config.backend)
     return {name: value for name, value in config.env_options.items() if name not in own}
 
 
-def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, NDArray[np.float64]]:
-    """Play one episode per arm with the deterministic policy; METRICS, each (N,)."""
+def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, Floats]:
+    """Play one episode per arm with the deterministic policy; returns METRICS, each (N,)."""
     results: list[dict[str, Any] | None] = [None] * env.num_envs
     observation: Any = env.reset()
     while any(result is None for result in results):
@@ -100,8 +100,8 @@ def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, NDArray[np.flo
     return {name: np.array(column, float) for name, column in zip(METRICS, columns, strict=True)}
 
 
-def spread(metrics: dict[str, NDArray[np.float64]]) -> dict[str, dict[str, float]]:
-    """Mean, standard deviation, least and largest of each metric over the episodes."""
+def spread(metrics: dict[str, Floats]) -> dict[str, dict[str, float]]:
+    """Mean, standard deviation, minimum and maximum of each metric over the episodes."""
     return {
         name: {
             "mean": float(values.mean()),

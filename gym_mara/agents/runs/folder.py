@@ -1,10 +1,10 @@
-"""A run folder: everything that one training leaves behind, and how to read it again.
+"""A run folder: the files of one training, and how they are written and read.
 
-config.json        what was asked for, the versions of the libraries
-progress.csv       a row per update
-tensorboard/       the same for TensorBoard
-checkpoints/N/     the policy, its normalisation and the state to go on from, after N steps
-best/, last/       the policy that did best in evaluation, and the last one, each with its normalisation
+config.json        the configuration, and the versions of the libraries
+progress.csv       a row per update and per evaluation
+tensorboard/       the same values for TensorBoard
+checkpoints/N/     the policy, its normalisation and the state to resume from, after N steps
+best/, last/       the policy with the best evaluation and the last one, each with its normalisation
 learning_curve.png
 """
 
@@ -27,17 +27,17 @@ from gym_mara.errors import GymMaraError, unknown
 
 POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "sb3_contrib", "torch")
-_ENGINES = ("coal", "dartpy", "python-fcl")  # where they are installed
-_Form = TypeVar("_Form")
+_ENGINES = ("coal", "dartpy", "python-fcl")  # recorded if installed
+_Dataclass = TypeVar("_Dataclass")
 
 
 class DamagedRunError(GymMaraError):
-    """What a run has left cannot be read."""
+    """A file of a run is missing or cannot be read."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run trains; together with the versions it repeats the run."""
+    """What a run trains. The same configuration with the same versions of the libraries gives the same run."""
 
     env: str
     algo: str
@@ -45,12 +45,12 @@ class RunConfig:
     steps: int
     seed: int
     checkpoint_every: int = 50_000
-    """How many steps lie between two checkpoints; each is evaluated."""
+    """Steps between two checkpoints; each checkpoint is evaluated."""
     env_options: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the environment besides `backend`."""
+    """Keyword arguments of the environment, without `backend`."""
     preset_name: str = DEFAULT_PRESET
     preset: dict[str, Any] = field(default_factory=dict)
-    """The preset as it was, so that a later change of it does not change the run."""
+    """The values of the preset, so that a later change of the preset does not change the run."""
 
 
 class RunFolder:
@@ -62,15 +62,19 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, config: RunConfig) -> RunFolder:
-        """Begin a run in a new folder.
+        """Make the folder of a new run.
 
         Raises:
-            GymMaraError: the folder exists; nothing is overwritten.
+            GymMaraError: the folder exists already, or cannot be made.
         """
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            hint = f", or go on with --resume {path}" if (path / "config.json").is_file() else ""
+            hint = (
+                f", or resume the run with --resume {path}"
+                if (path / "config.json").is_file()
+                else ""
+            )
             raise GymMaraError(
                 f"{str(path)!r} exists and is not overwritten: choose another --out{hint}"
             ) from None
@@ -91,11 +95,11 @@ class RunFolder:
         """The run in an existing folder.
 
         Raises:
-            GymMaraError: it is no run folder, or its configuration is damaged.
+            DamagedRunError: the folder holds no run, or its configuration is damaged.
         """
         file = path / "config.json"
         if not file.is_file():
-            raise DamagedRunError(f"{str(path)!r} is no run folder: it has no config.json")
+            raise DamagedRunError(f"{str(path)!r} is not a run folder: it has no config.json")
         try:
             values = dict(json.loads(file.read_text()))
             values.pop("versions")
@@ -109,11 +113,11 @@ class RunFolder:
 
     @property
     def progress_file(self) -> Path:
-        """The table of progress, a row per update."""
+        """The table of progress."""
         return self.path / "progress.csv"
 
     def seconds(self) -> float:
-        """How long the run has trained, up to its last checkpoint, s."""
+        """The training time up to the last checkpoint, s."""
         column = "time/time_elapsed"
         return max((r[column] for r in read_progress(self.progress_file) if column in r), default=0)
 
@@ -124,40 +128,40 @@ class RunFolder:
         return sorted(found, key=lambda p: int(p.name))
 
     def has_policy(self, which: str) -> bool:
-        """Whether the run has left the policy "last" or "best"."""
+        """Whether the run has a policy "last" or "best"."""
         return (self.path / which / "model.zip").is_file()
 
     def policy(self, which: str) -> Path:
         """The folder of the policy "last" or "best".
 
         Raises:
-            GymMaraError: the run has none yet.
+            GymMaraError: the run has no such policy yet.
         """
         folder = self.path / which
         if which not in POLICIES:
             raise unknown("policy", which, POLICIES)
         if not self.has_policy(which):
             raise GymMaraError(
-                f"the run {str(self.path)!r} has no {which!r} policy: it has not finished; go on with --resume"
+                f"the run {str(self.path)!r} has no {which!r} policy: it has not finished; resume it with --resume"
             )
         return folder
 
 
-def _as(form: type[_Form], values: dict[str, Any]) -> _Form:
-    """A dataclass with values that came from a file.
+def _as(cls: type[_Dataclass], values: dict[str, Any]) -> _Dataclass:
+    """A dataclass made of values from a file.
 
     Raises:
         TypeError: a field is missing, unknown, or of another type.
     """
-    made = form(**values)
-    for name, hint in get_type_hints(form).items():
+    made = cls(**values)
+    for name, hint in get_type_hints(cls).items():
         if type(value := getattr(made, name)) is not (get_origin(hint) or hint):
             raise TypeError(f"{name} is {value!r}")
     return made
 
 
 def write_atomically(file: Path, text: str) -> None:
-    """Write a file so that a reader, or a kill, finds the old or the new one, never a half."""
+    """Write a file so that at any time, even after a kill, it holds either the old text or the new one."""
     temporary = file.with_name(f".{file.name}.tmp")
     with temporary.open("w") as stream:
         stream.write(text)
@@ -167,7 +171,7 @@ def write_atomically(file: Path, text: str) -> None:
 
 
 def replace_folder(new: Path, target: Path) -> None:
-    """Put a finished folder in the place of another; a kill leaves one of the two in reach."""
+    """Replace a folder by a new one; after a kill at any time at least one of the two exists."""
     old = target.with_name(f".{target.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     if target.exists():
@@ -177,10 +181,10 @@ def replace_folder(new: Path, target: Path) -> None:
 
 
 def read_progress(file: Path) -> list[dict[str, float]]:
-    """The rows of a table of progress; a cell that is empty is left out of its row.
+    """The rows of a table of progress, without their empty cells.
 
     Raises:
-        DamagedRunError: it is no such table.
+        DamagedRunError: the file is not such a table.
     """
     try:
         with file.open(newline="") as stream:

@@ -1,4 +1,4 @@
-"""A policy on disk: the model and the normalisation that it was trained with, in one folder."""
+"""A policy on disk: a folder with the model and the normalisation that it was trained with."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, replace_fold
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.errors import GymMaraError
 
-# What reading a pickle or a zip that was cut short or overwritten raises; others than ValueError, which tells of a misfit.
+# The errors from reading a truncated or overwritten pickle or zip. ValueError is not among them: it means that the policy does
+# not fit the environment.
 DAMAGE = (
     OSError,
     EOFError,
@@ -41,7 +42,7 @@ DAMAGE = (
 
 
 def policy_arguments(preset: Preset) -> dict[str, Any]:
-    """Keyword arguments of a preset's policy."""
+    """The keyword arguments of a preset's policy network."""
     arguments = dict(preset.arguments.get("policy_kwargs", {}))
     if "optimizer_class" in arguments:
         arguments["optimizer_class"] = getattr(torch.optim, arguments["optimizer_class"])
@@ -51,7 +52,7 @@ def policy_arguments(preset: Preset) -> dict[str, Any]:
 def save_policy(
     folder: Path, model: OnPolicyAlgorithm, extra: dict[str, bytes] | None = None
 ) -> None:
-    """Write a policy's folder, with other files beside it, so that a kill leaves no half of it behind."""
+    """Write the folder of a policy, with other files in it; after a kill the folder holds the old policy or the new one."""
     temporary = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
@@ -66,19 +67,19 @@ def save_policy(
 def load_policy(
     folder: Path, config: RunConfig, env: MaraVecEnv
 ) -> tuple[ActorCriticPolicy, VecNormalize]:
-    """The policy in a folder, to act on an environment, which may be one whose joints are faster or slower.
+    """Load a policy to act in an environment, whose joints may be faster or slower than in training.
 
-    Only numbers are read; nothing is unpickled that could run code.
+    Only numbers are read. Nothing is unpickled that could run code.
 
     Raises:
         DamagedRunError: a file is missing or damaged.
-        GymMaraError: the policy is one of another environment.
+        GymMaraError: the policy has other spaces than the environment.
     """
     preset = Preset(**config.preset)
     make = policy_class(preset.policy)
     arguments = policy_arguments(preset)
     policy = make(env.observation_space, env.action_space, lambda _: 0.0, **arguments)
-    with _told(folder):
+    with _reading(folder):
         with zipfile.ZipFile(folder / "model.zip") as archive, archive.open("policy.pth") as file:
             weights = torch.load(io.BytesIO(file.read()), map_location="cpu", weights_only=True)
         policy.load_state_dict(weights)
@@ -88,13 +89,13 @@ def load_policy(
 
 
 def load_model(folder: Path, algo: str, env: MaraVecEnv) -> tuple[OnPolicyAlgorithm, VecNormalize]:
-    """The algorithm in a folder, to go on training; reading it unpickles, and a pickle can run any code.
+    """Load an agent to resume its training. This unpickles, and a pickle can run any code.
 
     Raises:
         DamagedRunError: a file is missing or damaged.
-        GymMaraError: the policy is one of another environment.
+        GymMaraError: the policy has other spaces than the environment.
     """
-    with _told(folder):
+    with _reading(folder):
         wrapped = _normalised(folder, env, training=True)
         file = folder / "model.zip"
         model = (
@@ -104,8 +105,8 @@ def load_model(folder: Path, algo: str, env: MaraVecEnv) -> tuple[OnPolicyAlgori
 
 
 @contextmanager
-def _told(folder: Path) -> Iterator[None]:
-    """Tell in a line what is wrong with a policy's folder."""
+def _reading(folder: Path) -> Iterator[None]:
+    """Turn the errors from reading a policy's folder into errors for the user."""
     try:
         _check_archive(folder / "model.zip")
         yield
@@ -118,20 +119,20 @@ def _told(folder: Path) -> Iterator[None]:
 
 
 def _check_archive(file: Path) -> None:
-    """Raises one of DAMAGE where an archive is not as it was written."""
+    """Raises one of DAMAGE if an archive is missing, truncated or changed."""
     if not zipfile.is_zipfile(file):
-        raise zipfile.BadZipFile(f"{file.name} is missing or no zip file")
+        raise zipfile.BadZipFile(f"{file.name} is missing or not a zip file")
     try:
         with zipfile.ZipFile(file) as archive:
             broken = archive.testzip()
-    except RuntimeError as error:  # a flag that says encrypted, or compressed in another way
+    except RuntimeError as error:  # a changed flag claims encryption or another compression
         raise zipfile.BadZipFile(f"{file.name}: {error}") from error
     if broken:
-        raise zipfile.BadZipFile(f"{file.name}: {broken} is not what was written")
+        raise zipfile.BadZipFile(f"{file.name}: the checksum of {broken} is wrong")
 
 
 def normalisation(model: OnPolicyAlgorithm) -> VecNormalize:
-    """The normalisation that every agent here is wrapped in, whether it normalises or only counts."""
+    """The normalisation around a model's environment; every agent here has one, even if it normalises nothing."""
     wrapped: Any = model.get_vec_normalize_env()
     assert isinstance(wrapped, VecNormalize)
     return wrapped
@@ -141,12 +142,12 @@ _STATISTICS = {"observation": "obs_rms", "return": "ret_rms"}
 
 
 def _normalisation_values(wrapped: VecNormalize) -> dict[str, Any]:
-    """A normalisation as plain values."""
+    """A normalisation as JSON values."""
     values: dict[str, Any] = {
         name: getattr(wrapped, name) for name in ("norm_obs", "norm_reward", "gamma")
     }
     for name, attribute in _STATISTICS.items():
-        running = vars(wrapped).get(attribute)  # there only if it is used
+        running = vars(wrapped).get(attribute)  # exists only if it is used
         if running is None:
             continue
         mean, variance = np.asarray(running.mean).tolist(), np.asarray(running.var).tolist()
@@ -155,7 +156,7 @@ def _normalisation_values(wrapped: VecNormalize) -> dict[str, Any]:
 
 
 def _normalised(folder: Path, env: MaraVecEnv, *, training: bool) -> VecNormalize:
-    """The environment in the normalisation of a folder."""
+    """The environment with the normalisation from a folder."""
     try:
         values = json.loads((folder / "normalisation.json").read_text())
         read = {name: values.pop(name) for name in _STATISTICS if name in values}

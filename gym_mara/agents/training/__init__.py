@@ -1,1 +1,1 @@
-"""Training: from a configuration to a run folder."""
+"""Training: it starts, resumes, checkpoints and plots a run."""

@@ -1,4 +1,4 @@
-"""The learning curve of a run as a picture."""
+"""The learning curve of a run as an image file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gym_mara.agents.runs.folder import RunFolder, read_progress
 
 
 def plot_learning_curve(run: RunFolder) -> Path:
-    """Draw reward and position error against steps into `learning_curve.png`, and return its path."""
+    """Draw rewards and position error against steps into `learning_curve.png`; returns its path."""
     rows = read_progress(run.progress_file)
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     reward, error = figure.subplots(2, 1, sharex=True)

@@ -1,4 +1,4 @@
-"""ACKTR as an algorithm of Stable-Baselines3: it learns, stays in its trust region, and goes through a file."""
+"""ACKTR as an algorithm of Stable-Baselines3: it learns, keeps to its trust region, and is saved and loaded."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.errors import GymMaraError
 
 
-class Watcher(BaseCallback):
-    """Notes what each update logs."""
+class LogCallback(BaseCallback):
+    """Keeps the values that each update logs."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.seen: list[dict[str, float]] = []
+        self.rows: list[dict[str, float]] = []
 
     def _on_rollout_start(self) -> None:
-        self.seen.append(dict(self.logger.name_to_value))
+        self.rows.append(dict(self.logger.name_to_value))
 
     def _on_step(self) -> bool:
         return True
 
     def of(self, name: str) -> list[float]:
-        return [values[name] for values in self.seen if name in values]
+        return [values[name] for values in self.rows if name in values]
 
 
 def test_it_learns_a_task_with_discrete_actions() -> None:
@@ -46,7 +46,7 @@ def test_it_learns_a_task_with_discrete_actions() -> None:
     model = ACKTR("MlpPolicy", env, n_steps=32, seed=0, device="cpu")
     model.learn(40_000)
     rewards, _ = evaluate_policy(model, env, n_eval_episodes=10, return_episode_rewards=True)
-    assert np.mean(rewards) > 100.0, "untrained it is some 20"
+    assert np.mean(rewards) > 100.0, "untrained it is about 20"
 
 
 def test_it_learns_to_reach() -> None:
@@ -61,31 +61,31 @@ def test_it_learns_to_reach() -> None:
         seed=0,
         device="cpu",
     )
-    watcher = Watcher()
-    model.learn(50_000, callback=watcher)
-    assert np.mean(watcher.of("train/policy_loss")) < 0.0
+    log = LogCallback()
+    model.learn(50_000, callback=log)
+    assert np.mean(log.of("train/policy_loss")) < 0.0
     observation: Any = env.reset()
     for _ in range(5):
         action, _ = model.predict(observation, deterministic=True)
         observation, reward, _, _ = env.step(action)
-    assert reward.min() > -0.4, "at the start it is -0.99"
+    assert reward.min() > -0.4, "untrained it is -0.99"
 
 
 @pytest.mark.parametrize("learning_rate", [0.25, 100.0])
 def test_an_update_moves_the_policy_no_further_than_the_trust_region(learning_rate: float) -> None:
     env = make_env("MARAOrient-v0", "pinocchio", 16, {})
     model = ACKTR("MlpPolicy", env, learning_rate, n_steps=8, target_kl=2e-3, seed=0, device="cpu")
-    watcher = Watcher()
-    model.learn(16 * 8 * 40, callback=watcher)
-    moved = watcher.of("train/kl")
+    log = LogCallback()
+    model.learn(16 * 8 * 40, callback=log)
+    moved = log.of("train/kl")
     assert len(moved) == 39
     assert max(moved) <= 2e-3
-    assert np.median(moved) > 1e-4, "it uses what it is allowed"
-    assert max(watcher.of("train/critic_kl")) <= model.critic_kl
+    assert np.median(moved) > 1e-4, "it uses its trust region"
+    assert max(log.of("train/critic_kl")) <= model.critic_kl
 
 
-def test_the_critic_soon_knows_an_offset() -> None:
-    """Of returns that all differ from its values by the same, and hardly from each other."""
+def test_the_critic_soon_learns_a_constant_offset() -> None:
+    """All returns differ from its values by about the same amount."""
     model = ACKTR("MlpPolicy", "Pendulum-v1", n_steps=64, gamma=0.0, seed=0, device="cpu")
     model.set_logger(Logger(None, []))
     observations = torch.randn(64, 3)
@@ -101,15 +101,15 @@ def test_one_step_of_one_environment_makes_an_update() -> None:
 
 
 def test_observations_may_be_dictionaries() -> None:
-    env = FlattenedLater(gymnasium.make("Pendulum-v1"))
+    env = DictObservation(gymnasium.make("Pendulum-v1"))
     model = ACKTR("MultiInputPolicy", env, n_steps=32, seed=0, device="cpu")
-    watcher = Watcher()
-    model.learn(32 * 30, callback=watcher)
-    assert 1e-5 < np.median(watcher.of("train/kl")) <= model.target_kl
+    log = LogCallback()
+    model.learn(32 * 30, callback=log)
+    assert 1e-5 < np.median(log.of("train/kl")) <= model.target_kl
 
 
-class FlattenedLater(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
-    """An environment with its observation in a dictionary."""
+class DictObservation(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
+    """An environment whose observation is a dictionary."""
 
     def __init__(self, env: gymnasium.Env) -> None:  # type: ignore[type-arg]
         super().__init__(env)
@@ -119,7 +119,7 @@ class FlattenedLater(gymnasium.ObservationWrapper):  # type: ignore[type-arg]
         return {"all": observation}
 
 
-def test_the_first_updates_are_cold() -> None:
+def test_the_first_updates_use_the_plain_gradient() -> None:
     model = ACKTR("MlpPolicy", "Pendulum-v1", n_steps=16, cold_updates=3, seed=0, device="cpu")
     calls = []
     natural = model.actor_optimizer.natural_gradient
@@ -133,7 +133,7 @@ def test_the_first_updates_are_cold() -> None:
     assert set(calls) == {3, 4}
 
 
-def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Path) -> None:
+def test_a_loaded_model_continues_like_the_saved_one(tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, seed=0))
     model = ACKTR("MlpPolicy", env, n_steps=16, seed=0, device="cpu")
     model.learn(16 * 2 * 15)
@@ -145,7 +145,7 @@ def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Pa
     assert loaded.target_kl == model.target_kl
     for before, after in zip(_state(model), _state(loaded), strict=True):
         assert torch.equal(before, after)
-    env.training = False  # its statistics, which the two share, stay as they are
+    env.training = False  # the two models share its statistics, which must not change
     for learner in (model, loaded):
         env.seed(1)
         env.reset()
@@ -156,7 +156,7 @@ def test_a_model_goes_through_a_file_and_learns_on_as_if_it_had_not(tmp_path: Pa
         assert torch.equal(one, other)
 
 
-def test_the_policy_never_narrows_below_what_float32_resolves() -> None:
+def test_the_standard_deviation_has_a_lower_bound() -> None:
     model = ACKTR("MlpPolicy", "Pendulum-v1", n_steps=16, seed=0, device="cpu")
     with torch.no_grad():
         model.policy.log_std.fill_(math.log(LEAST_STD) - 1.0)
@@ -180,7 +180,7 @@ def test_it_logs_to_tensorboard(tmp_path: Path) -> None:
     assert list(tmp_path.glob("ACKTR_1/events*"))
 
 
-def test_a_policy_of_other_layers_is_refused() -> None:
+def test_a_policy_with_other_layers_is_refused() -> None:
     class OddPolicy(ActorCriticPolicy):
         def _build_mlp_extractor(self) -> None:
             super()._build_mlp_extractor()
@@ -190,7 +190,7 @@ def test_a_policy_of_other_layers_is_refused() -> None:
         ACKTR(OddPolicy, "CartPole-v1", device="cpu")
 
 
-def test_an_action_space_it_does_not_know_is_refused() -> None:
+def test_an_unsupported_action_space_is_refused() -> None:
     class Odd(gymnasium.Env[np.ndarray, np.ndarray]):  # type: ignore[type-arg]
         observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
         action_space = gymnasium.spaces.MultiBinary(2)  # type: ignore[assignment]

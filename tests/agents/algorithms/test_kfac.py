@@ -1,4 +1,4 @@
-"""K-FAC: curvlinops and the exact Fisher matrix as referees; the trust region; what an update does step by step."""
+"""K-FAC: compared with curvlinops and with the exact Fisher matrix; its trust region; each part of an update."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _double_precision() -> object:
 
 
 def network(*sizes: int, linear: bool = False) -> nn.Sequential:
-    """A network with tanh between its layers, or nothing."""
+    """A network with tanh between its layers, or a linear one."""
     layers: list[nn.Module] = []
     for one, other in itertools.pairwise(sizes):
         layers += [nn.Linear(one, other), nn.Identity() if linear else nn.Tanh()]
@@ -38,14 +38,14 @@ def linear_layers(net: nn.Module) -> list[nn.Linear]:
 
 
 def observe(kfac: KFAC, net: nn.Module, x: Tensor, y: Tensor) -> None:
-    """Take up the factors of a Gaussian output of variance 1, drawn to be y."""
+    """Update the factors with a Gaussian output of variance 1 whose sample is y."""
     with kfac.watch():
         out = net(x)
     kfac.observe(0.5 * (out - y).square().sum(dim=1))
 
 
 def as_matrices(tensors: list[Tensor]) -> list[Tensor]:
-    """Weights and biases, in turn, as a matrix a layer."""
+    """Alternating weights and biases as one matrix for each layer."""
     pairs = zip(tensors[::2], tensors[1::2], strict=True)
     return [torch.cat([weight, bias[:, None]], dim=1) for weight, bias in pairs]
 
@@ -55,7 +55,7 @@ def test_factors_and_natural_gradient_are_those_of_curvlinops() -> None:
     x, y = torch.randn(EXAMPLES, 4), torch.randn(EXAMPLES, 3)
     kfac = KFAC(linear_layers(net), damping=1e-2)
     observe(kfac, net, x, y)
-    # Its squared error has no ½, so its G is four times ours; and it sums over the examples.
+    # The squared error of curvlinops has no factor ½, so its G is four times ours; and it sums over the examples.
     scale = 4.0 * EXAMPLES
     parameters = list(net.parameters())
     theirs = KFACLinearOperator(
@@ -78,7 +78,7 @@ def test_factors_and_natural_gradient_are_those_of_curvlinops() -> None:
 
 
 def exact_fisher(net: nn.Sequential, x: Tensor) -> Tensor:
-    """E[JᵀJ] of a Gaussian output of variance 1, its rows and columns the parameters one after another."""
+    """E[JᵀJ] for a Gaussian output of variance 1, with a row and a column for each parameter, in order."""
     parameters = dict(net.named_parameters())
 
     def output(values: dict[str, Tensor]) -> Tensor:
@@ -91,7 +91,7 @@ def exact_fisher(net: nn.Sequential, x: Tensor) -> Tensor:
 
 
 def kronecker(kfac: KFAC, layer: int) -> Tensor:
-    """A layer's block as a matrix, in the order of its parameters: the weights row by row, then the biases."""
+    """A layer's block of the Fisher matrix, in the order of its parameters: the weights row by row, then the biases."""
     state = kfac.state[kfac.param_groups[layer]["params"][0]]
     a, g = state["A"], state["G"]
     rows, columns = len(g), len(a)
@@ -103,7 +103,7 @@ def kronecker(kfac: KFAC, layer: int) -> Tensor:
 
 
 def test_the_fisher_matrix_of_a_linear_network_is_exact() -> None:
-    # There, and with a Gaussian output, Kronecker factors lose nothing within a layer.
+    # For a linear network with a Gaussian output, the Kronecker factors of a layer are exact.
     net = network(3, 4, 2, linear=True)
     x = torch.randn(64, 3)
     kfac = KFAC(linear_layers(net))
@@ -126,7 +126,7 @@ def test_the_natural_gradient_of_one_layer_solves_its_regression() -> None:
     kfac = KFAC(
         linear_layers(net), lr=1.0, damping=1e-12, momentum=0.0, trust_region=1e9, cold_updates=0
     )
-    for _ in range(300):  # to draw the factors well
+    for _ in range(300):  # to estimate the factors well
         kfac.param_groups[0]["updates"] += 1
         with torch.no_grad():
             drawn = net(x) + torch.randn(200, 2)
@@ -169,7 +169,7 @@ def test_without_a_measured_divergence_the_estimate_bounds_the_step() -> None:
     assert kfac.step() == pytest.approx(1e-3)
 
 
-def test_what_is_exact_takes_its_own_fisher_matrix() -> None:
+def test_a_parameter_with_a_known_fisher_matrix_uses_it() -> None:
     log_std = nn.Parameter(torch.zeros(2))
     kfac = KFAC(
         [], [(log_std, 2.0)], lr=0.5, damping=0.0, momentum=0.0, trust_region=1e3, cold_updates=0
@@ -179,7 +179,7 @@ def test_what_is_exact_takes_its_own_fisher_matrix() -> None:
     torch.testing.assert_close(log_std.data, torch.tensor([-0.25, 0.75]))
 
 
-def test_a_gradient_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
+def test_a_gradient_that_is_not_finite_is_an_error_and_changes_no_parameter() -> None:
     log_std = nn.Parameter(torch.zeros(2))
     kfac = KFAC([], [(log_std, 2.0)])
     log_std.grad = torch.tensor([math.nan, 0.0])
@@ -188,7 +188,7 @@ def test_a_gradient_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
     assert not log_std.any()
 
 
-def test_units_through_which_nothing_flows_stay_as_they_are() -> None:
+def test_dead_units_keep_their_parameters() -> None:
     dead = nn.Linear(3, 4)
     net = nn.Sequential(dead, nn.ReLU(), nn.Linear(4, 2))
     with torch.no_grad():
@@ -206,11 +206,11 @@ def test_units_through_which_nothing_flows_stay_as_they_are() -> None:
     assert all(parameter.isfinite().all() for parameter in net.parameters())
 
 
-def test_factors_that_are_not_finite_are_an_error_and_move_nothing() -> None:
+def test_factors_that_are_not_finite_are_an_error_and_change_no_parameter() -> None:
     net = network(2, 3, 1)
     before = [parameter.clone() for parameter in net.parameters()]
     kfac = KFAC(linear_layers(net), cold_updates=0)
-    x = torch.full((EXAMPLES, 2), 1e200)  # the units are saturated, and what comes out is finite
+    x = torch.full((EXAMPLES, 2), 1e200)  # the units are saturated, so the outputs are finite
     observe(kfac, net, x, torch.zeros(EXAMPLES, 1))
     net(x).square().mean().backward()  # type: ignore[no-untyped-call]
     with pytest.raises(TrainingDivergedError, match="factors are not finite"):
@@ -218,7 +218,7 @@ def test_factors_that_are_not_finite_are_an_error_and_move_nothing() -> None:
     assert all(torch.equal(*pair) for pair in zip(net.parameters(), before, strict=True))
 
 
-def test_a_step_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
+def test_a_step_that_is_not_finite_is_an_error_and_changes_no_parameter() -> None:
     log_std = nn.Parameter(torch.zeros(2))
     kfac = KFAC([], [(log_std, 2.0)], lr=1e300)
     log_std.grad = torch.full((2,), 1.0)
@@ -227,7 +227,7 @@ def test_a_step_that_is_not_finite_is_an_error_and_moves_nothing() -> None:
     assert not log_std.any()
 
 
-def test_predictions_that_are_not_finite_leave_the_factors_as_they_were() -> None:
+def test_predictions_that_are_not_finite_do_not_change_the_factors() -> None:
     net = network(2, 1)
     kfac = KFAC(linear_layers(net))
     x = torch.ones(10, 2)
@@ -239,7 +239,7 @@ def test_predictions_that_are_not_finite_leave_the_factors_as_they_were() -> Non
 
 
 @pytest.mark.parametrize("moved", [math.nan, math.inf, 1.0])
-def test_a_step_that_never_comes_within_the_trust_region_is_not_made(moved: float) -> None:
+def test_a_step_that_stays_outside_the_trust_region_is_not_made(moved: float) -> None:
     log_std = nn.Parameter(torch.tensor([0.1, 0.2]))
     before = log_std.detach().clone()
     kfac = KFAC([], [(log_std, 2.0)], trust_region=1e-3)
@@ -248,7 +248,7 @@ def test_a_step_that_never_comes_within_the_trust_region_is_not_made(moved: floa
     assert torch.equal(log_std, before)
 
 
-def test_an_error_in_the_middle_of_a_step_undoes_it() -> None:
+def test_an_error_during_a_step_undoes_it() -> None:
     log_std = nn.Parameter(torch.tensor([0.1, 0.2]))
     before = log_std.detach().clone()
     kfac = KFAC([], [(log_std, 2.0)])
@@ -262,7 +262,7 @@ def test_an_error_in_the_middle_of_a_step_undoes_it() -> None:
     assert torch.equal(log_std, before)
 
 
-def test_a_copy_goes_on_as_the_original() -> None:
+def test_a_copy_continues_like_the_original() -> None:
     net = network(2, 1)
     kfac = KFAC(linear_layers(net), damping=0.3, trust_region=0.02)
     net_copy, kfac_copy = copy.deepcopy((net, kfac))
@@ -285,12 +285,12 @@ def test_factors_are_running_averages() -> None:
         observe(kfac, net, torch.full((10, 2), value), torch.zeros(10, 1))
         kfac.param_groups[0]["updates"] += 1
         means.append(float(kfac.state[linear_layers(net)[0].weight]["A"][0, 0]))
-    # The plain mean of as many as the decay would weigh; then the decay.
+    # A plain mean of the first four, which is the memory of this decay; then the decay.
     assert means[:4] == pytest.approx([1.0, 2.5, 14 / 3, 7.5])
     assert means[4] == pytest.approx(0.75 * 7.5 + 0.25 * 25.0)
 
 
-def test_its_state_goes_through_a_state_dict() -> None:
+def test_its_state_is_saved_and_loaded_with_a_state_dict() -> None:
     net = network(4, 3)
     x = torch.randn(20, 4)
 

@@ -1,4 +1,4 @@
-"""The Gaussian policy in natural coordinates: torch's own Gaussian as referee, and that moving the coordinates changes nothing."""
+"""The Gaussian policy in natural coordinates: compared with torch's Gaussian, and unchanged when its coordinates move."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _referee(distribution: NaturalGaussian) -> MultivariateNormal:
     )
 
 
-def test_it_is_the_gaussian_that_its_parameters_say(distribution: NaturalGaussian) -> None:
+def test_it_is_the_gaussian_with_its_mean_and_covariance(distribution: NaturalGaussian) -> None:
     referee = _referee(distribution)
     actions = referee.sample()
     expected: torch.Tensor = referee.log_prob(actions)  # type: ignore[no-untyped-call]
@@ -52,7 +52,7 @@ def test_it_is_the_gaussian_that_its_parameters_say(distribution: NaturalGaussia
     torch.testing.assert_close(distribution.mode(), referee.mean)
 
 
-def test_its_divergence_is_that_of_the_gaussians(distribution: NaturalGaussian) -> None:
+def test_its_divergence_is_that_of_torch_s_gaussians(distribution: NaturalGaussian) -> None:
     generator = torch.Generator().manual_seed(2)
     noise = 0.1 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
     other = NaturalGaussian().proba_distribution(
@@ -126,7 +126,7 @@ def test_moving_the_coordinates_does_not_change_the_policy(model: PPO) -> None:
     torch.testing.assert_close(after.mode(), mode, rtol=1e-4, atol=1e-5)
 
 
-def test_the_policy_never_narrows_below_what_float32_resolves(model: PPO) -> None:
+def test_the_standard_deviations_have_a_lower_bound(model: PPO) -> None:
     policy = model.policy
     assert isinstance(policy, NaturalGaussianPolicy)
     policy(torch.as_tensor(model.env.reset()))  # type: ignore[union-attr]
@@ -146,7 +146,7 @@ def _widening_policy(widening: float) -> tuple[NaturalGaussianPolicy, torch.Tens
     return policy, torch.as_tensor(env.reset())
 
 
-def test_the_widening_ends() -> None:
+def test_the_widening_has_an_upper_bound() -> None:
     policy, observation = _widening_policy(1.0)
     for update in range(60):  # each narrows one direction, and so widens all
         policy(observation)
@@ -171,7 +171,7 @@ def test_the_widening_scales_the_policy_about_its_centre() -> None:
     torch.testing.assert_close(after - centre, scale * (before - centre), rtol=1e-4, atol=1e-5)
 
 
-def test_what_it_gathers_in_a_rollout_goes_where_the_policy_goes_but_not_to_disk() -> None:
+def test_the_sum_of_means_moves_with_the_policy_but_is_not_saved() -> None:
     policy, observation = _widening_policy(0.1)
     policy(observation)
     policy.double()
@@ -183,12 +183,12 @@ def test_what_it_gathers_in_a_rollout_goes_where_the_policy_goes_but_not_to_disk
 @pytest.mark.parametrize(
     ("env_id", "arguments"), [("CartPole-v1", {}), ("Pendulum-v1", {"use_sde": True})]
 )
-def test_what_the_policy_cannot_do_is_refused(env_id: str, arguments: dict[str, Any]) -> None:
+def test_unsupported_arguments_are_refused(env_id: str, arguments: dict[str, Any]) -> None:
     with pytest.raises(GymMaraError, match="box actions"):
         PPO(NaturalGaussianPolicy, env_id, device="cpu", **arguments)
 
 
-def test_what_the_reward_says_nothing_of_stays_wide() -> None:
+def test_directions_that_do_not_affect_the_reward_stay_wide() -> None:
     env = make_env("MARAOrient-v0", "pinocchio", 4, {})
     kwargs = {"widening": 0.1, "log_std_init": -2.0}
     ppo = PPO(NaturalGaussianPolicy, env, n_steps=4, batch_size=16, policy_kwargs=kwargs)
@@ -206,7 +206,7 @@ def test_what_the_reward_says_nothing_of_stays_wide() -> None:
     torch.testing.assert_close(changes, torch.tensor([0.05] * 5 + [-0.45]), atol=1e-3, rtol=0.0)
 
 
-def test_it_comes_back_from_disk(model: PPO, tmp_path: Path) -> None:
+def test_it_is_saved_and_loaded(model: PPO, tmp_path: Path) -> None:
     model.save(tmp_path / "model.zip")
     again = PPO.load(tmp_path / "model.zip", device="cpu")
     observation: Any = model.env.reset()  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""Films of a policy, and reports of its run."""
+"""Films and reports of a policy, and the command watch."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gym_mara.rendering.film import Film
 from tests.browser import chromium
 from tests.helpers import started
 
-# Readers of films leave pipes open.
+# The libraries that read films leave pipes open.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
@@ -38,18 +38,18 @@ def pictures(film: Path) -> Any:
 
 
 def differing(one: Any, other: Any) -> float:
-    """The part of two pictures' pixels that differ clearly."""
+    """The fraction of pixels that differ clearly between two pictures."""
     return float((np.abs(one.astype(int) - other.astype(int)).max(axis=-1) > 40).mean())
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_a_film_shows_the_beginning_of_an_episode(
+def test_a_film_shows_the_start_of_an_episode(
     finished_run: RunFolder, tmp_path: Path, suffix: str
 ) -> None:
     film = tmp_path / f"film{suffix}"
     film_run(finished_run, film, ["dart"], SMALL, seconds=0.4)
     shown = pictures(film)
-    if suffix == ".gif":  # the pictures of the start pose are one, shown for long
+    if suffix == ".gif":  # one picture of the start pose, with a long duration
         times = [imageio.immeta(film, index=index)["duration"] for index in range(len(shown))]
         assert times[0] == 500
         assert sum(times) == 900
@@ -61,14 +61,14 @@ def test_a_film_shows_the_beginning_of_an_episode(
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def test_two_backends_stand_side_by_side(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
     film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
     shown = pictures(film)
     assert shown.shape[1:] == (120, 320, 3)
     assert differing(shown[0, :, :160], shown[0, :, 160:]) < 0.001
-    there, on_its_way = shown[-1, :, :160], shown[-1, :, 160:]
-    assert differing(there, on_its_way) > 0.002
+    arrived, travelling = shown[-1, :, :160], shown[-1, :, 160:]
+    assert differing(arrived, travelling) > 0.002
 
 
 @pytest.mark.parametrize(("speed", "rate"), [(0.3, 15.0), (1.0, 50.0), (3.0, 50.0)])
@@ -83,7 +83,7 @@ def test_the_speed_of_a_film(
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("film.avi", "unknown format of a video"),
         ("film", "unknown format of a video"),
@@ -91,44 +91,44 @@ def test_the_speed_of_a_film(
         ("there.mp4", "exists and is not overwritten"),
     ],
 )
-def test_a_path_that_cannot_be_written_is_told_before_anything_is_played(
-    tmp_path: Path, name: str, told: str
+def test_a_wrong_path_of_a_film_is_an_error_before_the_policy_is_played(
+    tmp_path: Path, name: str, message: str
 ) -> None:
     (tmp_path / "there.mp4").write_text("kept")
-    with pytest.raises(GymMaraError, match=told):
+    with pytest.raises(GymMaraError, match=message):
         film_run(None, tmp_path / name, ["pinocchio"], {})  # type: ignore[arg-type]
     assert (tmp_path / "there.mp4").read_text() == "kept"
 
 
-def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_film_leaves_no_file(tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
 
-    def begin() -> None:
-        with Film(film, 25.0) as half:
-            half.add(np.zeros((120, 160, 3), np.uint8))
+    def interrupted() -> None:
+        with Film(film, 25.0) as unfinished:
+            unfinished.add(np.zeros((120, 160, 3), np.uint8))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        begin()
+        interrupted()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_film_of_an_odd_size(tmp_path: Path) -> None:
+def test_a_film_with_an_odd_size_is_cropped(tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
-    with Film(film, 25.0) as whole:
+    with Film(film, 25.0) as finished:
         for _ in range(3):
-            whole.add(np.full((101, 161, 3), 128, np.uint8))
+            finished.add(np.full((101, 161, 3), 128, np.uint8))
     assert pictures(film).shape == (3, 100, 160, 3)
 
 
 def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Path) -> None:
     file = write_report(finished_run, tmp_path / "report.html")
-    asked, complaints = [], []
+    requests, errors = [], []
     with chromium() as browser:
         context = browser.new_context(offline=True)
         page = context.new_page()
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(file.as_uri())
         headings = [
             "The policy",
@@ -155,11 +155,11 @@ def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Pat
         path = page.locator(".js-plotly-plot").nth(4).evaluate(traces)
         assert [name for name, _ in path] == ["pinocchio", "dart", "target"]
         assert '"seed": 5' in page.locator("pre").inner_text()
-    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
-    assert complaints == []
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert errors == []
 
 
-def test_a_report_overwrites_nothing_but_its_own(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_a_report_does_not_overwrite_another_file(finished_run: RunFolder, tmp_path: Path) -> None:
     mine = tmp_path / "mine.html"
     mine.write_text("kept")
     with pytest.raises(GymMaraError, match="not overwritten"):
@@ -169,7 +169,7 @@ def test_a_report_overwrites_nothing_but_its_own(finished_run: RunFolder, tmp_pa
         write_report(finished_run, tmp_path / "missing" / "report.html")
 
 
-def test_without_dart_a_report_says_what_is_missing(
+def test_a_report_names_a_backend_that_is_not_installed(
     finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in [name for name in sys.modules if name.startswith("gym_mara.backends.dart")]:
@@ -201,8 +201,8 @@ def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatc
         import gym_mara.agents.inspection.report  # noqa: F401
 
 
-@pytest.mark.parametrize("with_run", [True, False], ids=["run", "by hand"])
-def test_watch_serves_the_viewer_until_it_is_interrupted(
+@pytest.mark.parametrize("with_run", [True, False], ids=["run", "jog"])
+def test_watch_serves_the_viewer_until_an_interrupt(
     finished_run: RunFolder, with_run: bool
 ) -> None:
     what = [str(finished_run.path)] if with_run else ["--env", "MARAOrient-v0"]
@@ -221,7 +221,7 @@ def test_watch_serves_the_viewer_until_it_is_interrupted(
                 assert watching.poll() is None
                 time.sleep(0.2)
         time.sleep(1.0)
-        assert watching.poll() is None, "it goes on"
+        assert watching.poll() is None, "it keeps running"
         watching.send_signal(signal.SIGINT)
         out, _ = watching.communicate(timeout=30)
     assert watching.returncode == 130

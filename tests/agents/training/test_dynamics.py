@@ -1,4 +1,4 @@
-"""Agents on the dynamic backend: training, going on after a cut, and one policy on every backend."""
+"""Agents on the backend dart: training, resuming, and the transfer of a policy to other backends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALL = Preset(num_envs=16, policy="natural", arguments={"n_steps": 32, "batch_s
 
 
 def _train(out: Path, on_progress: OnProgress = silent, updates: int = 2) -> RunFolder:
-    """A run on the dynamic backend, with random parameters and few arms."""
+    """A run on dart, with random parameters and few arms."""
     options = {"randomisation": {"mass": [0.9, 1.1], "sensor_noise": [0.0, 1e-3]}}
     about: dict[str, Any] = {"env": "MARA-v0", "backend": "dart", "env_options": options}
     about |= {"steps": updates * ROLLOUT, "checkpoint_every": ROLLOUT}
@@ -35,23 +35,23 @@ def _train(out: Path, on_progress: OnProgress = silent, updates: int = 2) -> Run
 
 @pytest.fixture(scope="module")
 def dynamic_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A run that was trained to its end; tests must not change it."""
+    """A finished run; tests must not change it."""
     return _train(tmp_path_factory.mktemp("dynamic") / "run")
 
 
-def test_it_trains_and_goes_on_after_a_cut_as_if_there_had_been_none(
+def test_an_interrupted_run_is_resumed_with_the_same_result(
     dynamic_run: RunFolder, tmp_path: Path
 ) -> None:
-    def cut(steps: int, shown: dict[str, float]) -> None:
+    def interrupt(steps: int, shown: dict[str, float]) -> None:
         if steps > ROLLOUT:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "run", cut)
+        _train(tmp_path / "run", interrupt)
     assert_same_training(dynamic_run, resume(tmp_path / "run", silent))
 
 
-def test_a_worker_that_dies_ends_the_training_and_leaves_the_run_to_go_on_with(
+def test_a_run_is_resumed_after_a_worker_has_died(
     dynamic_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[WorkerBackend] = []
@@ -75,9 +75,7 @@ def test_a_worker_that_dies_ends_the_training_and_leaves_the_run_to_go_on_with(
     assert resume(tmp_path / "run", silent).has_policy("last")
 
 
-def test_a_policy_plays_on_a_backend_that_it_was_not_trained_on(
-    finished_run: RunFolder, dynamic_run: RunFolder
-) -> None:
+def test_a_policy_plays_on_another_backend(finished_run: RunFolder, dynamic_run: RunFolder) -> None:
     for run, backend in ((finished_run, "dart"), (dynamic_run, "pinocchio")):
         metrics = evaluate_run(run, backend=backend, episodes=1)
         assert all(np.isfinite(values).all() for values in metrics.values())
@@ -107,23 +105,25 @@ def test_transfer_plays_a_policy_on_every_backend(dynamic_run: RunFolder) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"options": {"colour": 1}}, "no backend knows the setting 'colour'"),
+        ({"episodes": 0}, "episodes must be a whole number of at least 1"),
+        ({"options": {"colour": 1}}, "no installed backend knows the setting 'colour'"),
         ({"which": "worst"}, "unknown policy"),
     ],
 )
-def test_a_wrong_transfer(dynamic_run: RunFolder, arguments: dict[str, Any], message: str) -> None:
+def test_wrong_arguments_of_a_transfer_are_an_error(
+    dynamic_run: RunFolder, arguments: dict[str, Any], message: str
+) -> None:
     with pytest.raises(GymMaraError, match=message):
         transfer(dynamic_run, **arguments)
 
 
-def test_an_arm_has_settled_once_its_error_stays_near_its_last() -> None:
+def test_an_arm_has_settled_once_its_error_stays_close_to_its_final_value() -> None:
     far, near = 1.0 + 2.0 * SETTLED, 1.0 + 0.5 * SETTLED
     errors = np.array([[far, near, near], [near, far, 1.0], [near, near, near], [1.0, 1.0, 1.0]])
     assert settled_after(errors).tolist() == [1.0, 2.0, 0.0]
 
 
-def test_a_policy_of_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
+def test_a_policy_with_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
     from gym_mara.agents.runs.policy import load_policy
 
     env = make_env("MARAOrient-v0", "pinocchio", 1, {})

@@ -1,4 +1,4 @@
-"""Training: what a run leaves behind, and that it goes on after a cut as if there had been none."""
+"""Training: the files of a run, and that an interrupted run is resumed with the same result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
 
 
 def assert_same_training(run: RunFolder, other: RunFolder) -> None:
-    """The two runs learnt the same, to the bit, and logged the same but for the clock."""
+    """The two runs have the same weights to the bit, and the same log except for times."""
     mine, theirs = parameters(run), parameters(other)
     assert all(torch.equal(mine[name], theirs[name]) for name in mine)
     tables = []
@@ -52,7 +52,7 @@ def assert_same_training(run: RunFolder, other: RunFolder) -> None:
     assert tables[0] == tables[1]
 
 
-def test_a_run_leaves_all_that_it_should(finished_run: RunFolder) -> None:
+def test_a_run_writes_all_its_files(finished_run: RunFolder) -> None:
     path = finished_run.path
     about = json.loads((path / "config.json").read_text())
     assert about["seed"] == 5
@@ -80,22 +80,22 @@ def test_another_seed_trains_another_policy(finished_run: RunFolder, tmp_path: P
     assert not all(torch.equal(mine[name], theirs[name]) for name in mine)
 
 
-@pytest.mark.parametrize("updates_before_the_cut", [1, 2])
-def test_a_cut_off_run_goes_on_as_if_it_had_not_been(
-    finished_run: RunFolder, tmp_path: Path, updates_before_the_cut: int
+@pytest.mark.parametrize("updates_before_the_interrupt", [1, 2])
+def test_an_interrupted_run_is_resumed_with_the_same_result(
+    finished_run: RunFolder, tmp_path: Path, updates_before_the_interrupt: int
 ) -> None:
-    def cut(steps: int, shown: dict[str, float]) -> None:
-        # Reported at the end of a rollout: the update that follows is lost, its steps are not in a checkpoint.
-        if steps > updates_before_the_cut * ROLLOUT:
+    def interrupt(steps: int, shown: dict[str, float]) -> None:
+        # This is called at the end of a rollout, so the update that follows and the steps of the rollout are lost.
+        if steps > updates_before_the_interrupt * ROLLOUT:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(config(), tmp_path / "run", cut)
+        train(config(), tmp_path / "run", interrupt)
     resumed = resume(tmp_path / "run", silent)
     assert_same_training(finished_run, resumed)
 
 
-def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+def test_a_killed_run_is_resumed_from_its_last_checkpoint(tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = ["-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
     with started(*command, "--checkpoint-every", str(ROLLOUT)) as process:
@@ -113,30 +113,30 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(tmp_path: Path) -
     assert resumed.has_policy("last")
 
 
-def test_a_run_cut_off_before_its_first_checkpoint_begins_anew(
+def test_a_run_interrupted_before_its_first_checkpoint_starts_again(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
-    def cut(steps: int, shown: dict[str, float]) -> None:
+    def interrupt(steps: int, shown: dict[str, float]) -> None:
         if steps:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(config(), tmp_path / "run", cut)
+        train(config(), tmp_path / "run", interrupt)
     assert_same_training(finished_run, resume(tmp_path / "run", silent))
 
 
-def test_a_run_cut_off_after_its_last_checkpoint_is_finished(
+def test_a_run_interrupted_after_its_last_checkpoint_is_finished(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
     shutil.copytree(finished_run.path, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "last")
     (tmp_path / "run" / "learning_curve.png").unlink()
     resumed = resume(tmp_path / "run", silent)
-    assert_same_training_but_log(finished_run, resumed)
+    assert_same_policy(finished_run, resumed)
     assert (resumed.path / "learning_curve.png").is_file()
 
 
-def test_the_curve_is_drawn_before_a_run_counts_as_finished(
+def test_the_learning_curve_is_drawn_before_a_run_counts_as_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def kill(run: RunFolder) -> None:
@@ -150,8 +150,8 @@ def test_the_curve_is_drawn_before_a_run_counts_as_finished(
     assert (resumed.path / "learning_curve.png").is_file()
 
 
-def assert_same_training_but_log(run: RunFolder, other: RunFolder) -> None:
-    """The two runs ended with the same policy."""
+def assert_same_policy(run: RunFolder, other: RunFolder) -> None:
+    """The two runs have the same last policy."""
     mine, theirs = parameters(run), parameters(other)
     assert all(torch.equal(mine[name], theirs[name]) for name in mine)
 
@@ -161,7 +161,7 @@ def test_a_finished_run_is_not_resumed(finished_run: RunFolder) -> None:
         resume(finished_run.path, silent)
 
 
-def test_a_folder_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(GymMaraError, match="not overwritten"):
         train(config(), tmp_path, silent)
@@ -189,11 +189,11 @@ def test_a_wrong_configuration_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluation_reports_each_metric_of_each_episode(finished_run: RunFolder) -> None:
+def test_an_evaluation_has_each_metric_of_each_episode(finished_run: RunFolder) -> None:
     metrics = evaluate_run(finished_run, episodes=3)
     assert tuple(metrics) == METRICS
     assert all(values.shape == (3,) for values in metrics.values())
-    # Start pose and policy are the same in every episode, and so, but for rounding, is what comes of them.
+    # Start pose and policy are the same in every episode, so the results are the same up to rounding.
     for name, values in metrics.items():
         np.testing.assert_allclose(values, values[0], rtol=1e-5, err_msg=name)
     np.testing.assert_allclose(metrics["return"], 2048 * metrics["reward_per_step"], rtol=1e-9)
@@ -201,7 +201,7 @@ def test_evaluation_reports_each_metric_of_each_episode(finished_run: RunFolder)
     assert summary["return"].keys() == {"mean", "std", "min", "max"}
 
 
-def test_evaluation_plays_what_the_policy_was_trained_for(
+def test_an_evaluation_uses_the_environment_of_the_training(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
     options = {"max_joint_velocity": 1.0, "start_q": [0.1] * 6}
@@ -213,20 +213,20 @@ def test_evaluation_plays_what_the_policy_was_trained_for(
 
 
 @pytest.mark.parametrize("episodes", [0, -1])
-def test_evaluation_wants_an_episode(finished_run: RunFolder, episodes: int) -> None:
+def test_an_evaluation_needs_an_episode(finished_run: RunFolder, episodes: int) -> None:
     with pytest.raises(GymMaraError, match="episodes must be at least 1"):
         evaluate_run(finished_run, episodes=episodes)
 
 
 def copy_of(run: RunFolder, path: Path) -> RunFolder:
-    """A run that a test may damage."""
+    """A copy of a run, which a test may damage."""
     shutil.copytree(run.path, path)
     return RunFolder.open(path)
 
 
 @pytest.mark.parametrize("file", ["model.zip", "normalisation.json"])
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "a bit"])
-def test_a_damaged_policy_is_named(
+def test_a_damaged_policy_is_an_error(
     finished_run: RunFolder, tmp_path: Path, file: str, damage: str
 ) -> None:
     run = copy_of(finished_run, tmp_path / "run")
@@ -245,7 +245,7 @@ def test_a_damaged_policy_is_named(
 
 
 @pytest.mark.parametrize("part", ["data", "policy.pth", "pytorch_variables.pth"])
-def test_a_checkpoint_with_a_flipped_bit_is_named(
+def test_a_checkpoint_with_a_flipped_bit_is_an_error(
     finished_run: RunFolder, tmp_path: Path, part: str
 ) -> None:
     run = copy_of(finished_run, tmp_path / "run")
@@ -260,9 +260,9 @@ def test_a_checkpoint_with_a_flipped_bit_is_named(
         resume(run.path, silent)
 
 
-# Compressed in another way, encrypted, of a later version of the format.
+# The flipped bits claim another compression, encryption, and a later version of the format.
 @pytest.mark.parametrize(("place", "bit"), [(10, 64), (8, 1), (6, 128)])
-def test_a_policy_whose_directory_of_parts_has_a_flipped_bit_is_named(
+def test_a_policy_with_a_flipped_bit_in_the_directory_of_its_archive_is_an_error(
     finished_run: RunFolder, tmp_path: Path, place: int, bit: int
 ) -> None:
     run = copy_of(finished_run, tmp_path / "run")
@@ -276,7 +276,7 @@ def test_a_policy_whose_directory_of_parts_has_a_flipped_bit_is_named(
         evaluate_run(run, episodes=1)
 
 
-def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
+def test_an_evaluation_runs_no_code_from_the_policy_s_file(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
     run = copy_of(finished_run, tmp_path / "run")
@@ -294,29 +294,29 @@ def test_evaluating_a_policy_runs_no_code_that_its_file_carries(
     evaluate_run(run, episodes=1)
     assert not trap.exists()
     PPO.load(file)
-    assert trap.exists(), "Stable-Baselines3's own way runs it"
+    assert trap.exists(), "loading it with Stable-Baselines3 runs the code"
 
 
 class Trap:
-    """Makes a file where it is unpickled."""
+    """Makes a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _spring, (self.path,)
+        return _make_file, (self.path,)
 
 
-def _spring(path: Path) -> float:
+def _make_file(path: Path) -> float:
     path.touch()
     return 0.2
 
 
-def test_a_damaged_checkpoint_is_named(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_an_error(finished_run: RunFolder, tmp_path: Path) -> None:
     run = copy_of(finished_run, tmp_path / "run")
     shutil.rmtree(run.path / "last")
     (run.checkpoints()[-1] / "state.pkl").write_bytes(b"")
-    with pytest.raises(GymMaraError, match=r"damaged.*go on from the one before"):
+    with pytest.raises(GymMaraError, match=r"damaged.*resume from the one before"):
         resume(run.path, silent)
 
 
@@ -345,7 +345,7 @@ def test_a_policy_of_another_environment_is_refused(
         {"preset": {"num_envs": 1, "policy": "mpl"}},
     ],
 )
-def test_a_configuration_of_another_form_is_named(
+def test_a_configuration_with_wrong_types_is_an_error(
     finished_run: RunFolder, tmp_path: Path, change: dict[str, Any]
 ) -> None:
     values = json.loads((finished_run.path / "config.json").read_text())
@@ -354,12 +354,12 @@ def test_a_configuration_of_another_form_is_named(
         RunFolder.open(tmp_path)
 
 
-def test_a_preset_of_an_unknown_policy_is_refused() -> None:
+def test_a_preset_with_an_unknown_policy_is_refused() -> None:
     with pytest.raises(GymMaraError, match=r"unknown policy 'mpl'\. Did you mean 'mlp'"):
         Preset(num_envs=1, policy="mpl")
 
 
-def test_a_run_is_trained_by_one_process_at_a_time(
+def test_only_one_process_at_a_time_trains_a_run(
     finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = copy_of(finished_run, tmp_path / "run")
@@ -367,7 +367,9 @@ def test_a_run_is_trained_by_one_process_at_a_time(
     shutil.rmtree(run.checkpoints()[-1])
     table = run.progress_file.read_bytes()
     with monkeypatch.context() as patch, FileLock(run.path / ".lock"):
-        patch.delattr(train_module, "load_model")  # what the other may be writing is not read
+        patch.delattr(
+            train_module, "load_model"
+        )  # the checkpoint must not be read while the other process may write it
         with pytest.raises(GymMaraError, match="another process"):
             resume(run.path, silent)
     assert run.progress_file.read_bytes() == table
@@ -377,12 +379,12 @@ def test_a_run_is_trained_by_one_process_at_a_time(
 def test_a_run_in_training_is_not_resumed(tmp_path: Path) -> None:
     refused: list[int] = []
 
-    def meddle(steps: int, shown: dict[str, float]) -> None:
+    def resume_meanwhile(steps: int, shown: dict[str, float]) -> None:
         with pytest.raises(GymMaraError, match="another process"):
             resume(tmp_path / "run", silent)
         refused.append(steps)
 
-    train(config(), tmp_path / "run", meddle)
+    train(config(), tmp_path / "run", resume_meanwhile)
     assert refused == [ROLLOUT * n for n in range(4)]
 
 
@@ -399,8 +401,8 @@ def test_a_resumed_tensorboard_log_has_every_step_once(
     assert steps == [ROLLOUT * (n + 1) for n in range(3)]
 
 
-# The parameters are NaN; the standard deviation has overflowed; a matrix of the policy cannot be factored; K-FAC's step
-# is not finite.
+# In turn: the parameters are NaN; the standard deviation overflows; a matrix of the policy cannot be factorised; the step of
+# K-FAC is not finite.
 @pytest.mark.parametrize(
     ("algo", "preset_name", "wild"),
     [
@@ -410,7 +412,7 @@ def test_a_resumed_tensorboard_log_has_every_step_once(
         ("acktr", "tuned", {"learning_rate": 1e30}),
     ],
 )
-def test_a_training_that_diverges_says_so(
+def test_a_diverging_training_is_an_error(
     tmp_path: Path, algo: str, preset_name: str, wild: dict[str, float]
 ) -> None:
     preset = algorithm(algo).preset(preset_name, teleports=True)
@@ -420,7 +422,7 @@ def test_a_training_that_diverges_says_so(
         train(asked, tmp_path / "run", silent, preset=preset)
 
 
-def test_a_training_that_fails_otherwise_says_what_failed(
+def test_another_failure_is_not_taken_for_divergence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: Any) -> None:
@@ -433,42 +435,42 @@ def test_a_training_that_fails_otherwise_says_what_failed(
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_however_a_training_ends_its_environments_are_closed(
+def test_a_failed_training_closes_its_environments(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
 ) -> None:
     opened: list[MaraVecEnv] = []
     closed: list[MaraVecEnv] = []
-    begin, close = MaraVecEnv.__init__, MaraVecEnv.close
+    open_, close = MaraVecEnv.__init__, MaraVecEnv.close
 
-    def note_beginning(env: MaraVecEnv, *arguments: Any) -> None:
+    def note_opening(env: MaraVecEnv, *arguments: Any) -> None:
         opened.append(env)
-        begin(env, *arguments)
+        open_(env, *arguments)
 
-    def note_end(env: MaraVecEnv) -> None:
+    def note_closing(env: MaraVecEnv) -> None:
         closed.append(env)
         close(env)
 
-    def cut(steps: int, shown: dict[str, float]) -> None:
+    def interrupt(steps: int, shown: dict[str, float]) -> None:
         if steps:
             raise error
 
-    monkeypatch.setattr(MaraVecEnv, "__init__", note_beginning)
-    monkeypatch.setattr(MaraVecEnv, "close", note_end)
+    monkeypatch.setattr(MaraVecEnv, "__init__", note_opening)
+    monkeypatch.setattr(MaraVecEnv, "close", note_closing)
     with pytest.raises(error):
-        train(config(), tmp_path / "run", cut)
-    assert len(opened) == 3  # to ask whether joints teleport, to train, to evaluate
+        train(config(), tmp_path / "run", interrupt)
+    assert len(opened) == 3  # to find out whether joints teleport, to train, and to evaluate
     assert {id(env) for env in opened} == {id(env) for env in closed}
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", '{"env": "MARA-v0", "versions": {}}'])
-def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+def test_a_damaged_configuration_is_an_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(GymMaraError, match="damaged"):
         RunFolder.open(tmp_path)
 
 
-def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
-    with pytest.raises(GymMaraError, match="no run folder"):
+def test_a_folder_without_a_run_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(GymMaraError, match="not a run folder"):
         RunFolder.open(tmp_path)
 
 
