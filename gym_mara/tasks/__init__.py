@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from gym_mara.errors import unknown
-from gym_mara.tasks.base import Goal, Task, Workspace
+from gym_mara.tasks.base import Task, Workspace
+from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Observation, Part
 from gym_mara.tasks.random_reach import RandomReachTask
 from gym_mara.tasks.reach import ReachTask

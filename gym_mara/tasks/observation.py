@@ -11,11 +11,11 @@ from gymnasium.spaces import Box
 
 from gym_mara.errors import GymMaraError
 from gym_mara.state import SimState
+from gym_mara.tasks.goal import Goal
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:
     from gym_mara.robot import RobotModel
-    from gym_mara.tasks.base import Goal
 
 _ONE = 1.0 + 1e-9
 """The bound of a unit quaternion's components, with a margin for rounding."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import observation
-from gym_mara.tasks.base import Goal, Workspace
+from gym_mara.tasks.base import Workspace
+from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
 from gym_mara.tasks.reach import ReachTask
 from gym_mara.types import Floats

@@ -13,7 +13,8 @@ from gym_mara import rotations
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
-from gym_mara.tasks.base import Goal, Task, Workspace
+from gym_mara.tasks.base import Task, Workspace
+from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
 from gym_mara.types import Floats, Mask
 
