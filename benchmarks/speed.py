@@ -70,7 +70,7 @@ def batch(
     """Steps of the native vector environment with random actions; `by_samples` checks every path by samples."""
     envs: Any = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
     if by_samples:
-        envs.unwrapped.simulation.backend._with_room = None
+        envs.unwrapped.simulation.backend._with_margin = None
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(10)]

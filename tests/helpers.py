@@ -25,8 +25,8 @@ ENV_IDS = tuple(f"gym_mara/{name}" for name in TASK_NAMES)
 TARGET_Q = (-0.237, -0.5528, 0.8681, 0.0, 1.7207, -0.237)
 """A configuration of MARA within 0.02 mm of the default target."""
 PATH_ENDS = ((0.5, -1.9, -0.3, -2.4, 1.1, -2.6), (0.5, -1.9, -0.3, 2.4, 1.1, -2.6))
-"""Two collision-free configurations of MARA. On the way, with motor4 between about -1.15 and 1.06 rad, the tool collides
-with the arm."""
+"""Two collision-free configurations of MARA. On the way, with motor4 between about -1.15 and 1.06 rad, the tool
+collides with the arm."""
 
 MODULAR_ARMS: dict[int, list[str]] = {
     3: ["base", "motor_large", "motor_medium", "tool"],

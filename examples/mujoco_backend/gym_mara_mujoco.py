@@ -12,6 +12,7 @@ from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
+from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -162,7 +163,7 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
         bodies.append(_add_joint(spec, robot, number, bodies[robot.model.parents[number]]))
     shapes = robot.geometry.geometryObjects
     for shape in shapes:
-        _add_shape(spec, bodies[shape.parentJoint], shape)
+        _add_shape(spec, bodies[shape.parentJoint], robot.model, shape)
     for pair in robot.geometry.collisionPairs:
         spec.add_pair(geomname1=shapes[pair.first].name, geomname2=shapes[pair.second].name)
     try:
@@ -208,28 +209,27 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
     return body
 
 
-def _add_shape(spec: Any, body: Any, shape: pin.GeometryObject) -> None:
+def _add_shape(spec: Any, body: Any, model: pin.Model, geometry: pin.GeometryObject) -> None:
     """Add one of Pinocchio's geometry objects; it collides only in the pairs that `build_model` adds."""
-    geometry, kinds = shape.geometry, mujoco.mjtGeom
-    name = type(geometry).__name__
-    options: dict[str, Any]
-    if name == "Box":
-        options = {"type": kinds.mjGEOM_BOX, "size": geometry.halfSide}
-    elif name == "Sphere":
-        options = {"type": kinds.mjGEOM_SPHERE, "size": (geometry.radius, 0.0, 0.0)}
-    elif name in ("Cylinder", "Capsule"):
-        kind = kinds.mjGEOM_CYLINDER if name == "Cylinder" else kinds.mjGEOM_CAPSULE
-        options = {"type": kind, "size": (geometry.radius, geometry.halfLength, 0.0)}
-    elif name.startswith("BVHModel"):
-        spec.add_mesh(
-            name=shape.name,
-            uservert=geometry.vertices().ravel(),
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
-        )
-        options = {"type": kinds.mjGEOM_MESH, "meshname": shape.name}
-    else:
-        raise GymMaraError(f"the backend 'mujoco' does not know the shape {name} of {shape.name!r}")
-    body.add_geom(name=shape.name, contype=0, conaffinity=0, **options, **_placed(shape.placement))
+    kinds, options = mujoco.mjtGeom, dict[str, Any]()
+    match shape_of(model, geometry):
+        case Box(size):
+            options = {"type": kinds.mjGEOM_BOX, "size": 0.5 * size}
+        case Sphere(radius):
+            options = {"type": kinds.mjGEOM_SPHERE, "size": (radius, 0.0, 0.0)}
+        case Cylinder(radius, length):
+            options = {"type": kinds.mjGEOM_CYLINDER, "size": (radius, 0.5 * length, 0.0)}
+        case Capsule(radius, length):
+            options = {"type": kinds.mjGEOM_CAPSULE, "size": (radius, 0.5 * length, 0.0)}
+        case Mesh(vertices=vertices):
+            spec.add_mesh(
+                name=geometry.name,
+                uservert=vertices.ravel(),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
+            )
+            options = {"type": kinds.mjGEOM_MESH, "meshname": geometry.name}
+    placement = _placed(geometry.placement)
+    body.add_geom(name=geometry.name, contype=0, conaffinity=0, **options, **placement)
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:

@@ -1,4 +1,4 @@
-"""The MuJoCo backend: the contract of every backend, and what is MuJoCo's own."""
+"""The MuJoCo backend: the contract of every backend, and what is specific to MuJoCo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import BackendContract, Make, uniform_q
 
-# A slide that carries a pendulum: another kind of joint, of shape, and friction and damping. It cannot hold its pole.
+# A cart that carries a pole: a prismatic joint, other shapes, friction and damping. The hinge is too weak to hold the pole.
 SLIDER = """
 <robot name="slider">
   <link name="rail"><collision><origin xyz="-0.5 0 -0.3"/>
@@ -58,7 +58,7 @@ def slider(tmp_path: Path) -> RobotModel:
 @pytest.fixture(params=["mara", "slider", "ur5"])
 def robot(request: pytest.FixtureRequest) -> RobotModel:
     if request.param == "ur5":
-        return RobotModel.load("ur5")  # of meshes
+        return RobotModel.load("ur5")  # has meshes
     return request.getfixturevalue(request.param)  # type: ignore[no-any-return]
 
 
@@ -68,9 +68,9 @@ class TestContract(BackendContract):
         return lambda num_envs: MujocoBackend(mara, num_envs)
 
 
-def test_a_limp_arm_accelerates_as_pinocchio_says(robot: RobotModel) -> None:
+def test_an_arm_without_motors_accelerates_as_pinocchio_says(robot: RobotModel) -> None:
     model = build_model(robot, 0.002)
-    # Contact, joint stops and Coulomb friction are constraints; Pinocchio's algorithm has none.
+    # Pinocchio's algorithm has no contact, joint stops or Coulomb friction; in MuJoCo they are constraints.
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     data, reference = mujoco.MjData(model), robot.model.createData()
     rng = np.random.default_rng(0)
@@ -98,7 +98,7 @@ def test_a_target_is_reached_and_held_against_gravity(mara: RobotModel) -> None:
     np.testing.assert_allclose(state.torque[0], gravity, atol=0.05)
 
 
-def test_a_slide_with_friction_follows_too(slider: RobotModel) -> None:
+def test_a_prismatic_joint_with_friction_reaches_its_target(slider: RobotModel) -> None:
     backend = MujocoBackend(slider, 1)
     target = np.array([[0.4, 0.0]])
     for _ in range(150):
@@ -106,7 +106,7 @@ def test_a_slide_with_friction_follows_too(slider: RobotModel) -> None:
     np.testing.assert_allclose(state.q[0, 0], 0.4, atol=1e-3)
 
 
-def test_the_motors_keep_within_their_limits(robot: RobotModel) -> None:
+def test_motors_and_joints_stay_within_their_limits(robot: RobotModel) -> None:
     backend = MujocoBackend(robot, 4)
     rng = np.random.default_rng(0)
     low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
@@ -120,7 +120,7 @@ def test_the_motors_keep_within_their_limits(robot: RobotModel) -> None:
     assert (np.max(efforts, axis=(0, 1)) <= robot.effort_limit).all()
 
 
-def test_a_joint_moves_at_its_limit_of_velocity_as_the_engine_has_it(mara: RobotModel) -> None:
+def test_a_joint_moves_at_max_joint_velocity(mara: RobotModel) -> None:
     backend = MujocoBackend(mara, 1, max_joint_velocity=0.5)
     np.testing.assert_array_equal(backend.joint_velocity, 0.5)
     backend.reset(np.zeros((1, 6)))
@@ -137,7 +137,7 @@ def test_in_free_space_no_joint_travels_faster_than_its_limit(mara: RobotModel) 
         assert not state.collided.any()
         speed = (
             np.abs(state.q - before) / backend.control_period
-        )  # not qd, which is cut to the limit
+        )  # not qd, which is clipped to the limit
         assert (speed <= 1.001 * mara.velocity_limit).all()
         before = state.q
 
@@ -153,7 +153,7 @@ def test_a_motor_too_weak_to_hold_its_load_lets_it_fall(slider: RobotModel) -> N
     assert state.torque[0, 1] == slider.effort_limit[1]
 
 
-def test_at_equal_q_it_sees_the_collisions_that_the_pinocchio_backend_sees(
+def test_at_equal_q_it_collides_where_the_pinocchio_backend_does(
     robot: RobotModel,
 ) -> None:
     q = uniform_q(robot, 300, 0)
@@ -167,7 +167,7 @@ def test_at_equal_q_it_sees_the_collisions_that_the_pinocchio_backend_sees(
 
 
 def test_mujoco_has_a_contact_wherever_links_touch(robot: RobotModel) -> None:
-    """What `collided` relies on within a period."""
+    """`collided` relies on it."""
     model = build_model(robot, 0.002)
     data = mujoco.MjData(model)
     q = uniform_q(robot, 300, 1)
@@ -186,10 +186,14 @@ def test_the_table_stops_the_arm(mara: RobotModel) -> None:
     assert any(state.collided[0] for state in states)
     assert np.abs(states[-1].q - target).max() > 0.1
     np.testing.assert_allclose(states[-1].qd, 0.0, atol=1e-3)
+    assert states[-1].contacts is not None
+    (contacts,) = states[-1].contacts
+    assert any("table" in contact.links for contact in contacts)
+    assert all(0.0 <= contact.depth < 0.02 for contact in contacts)
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         ({"control_period": 0.0}, "control_period"),
         ({"physics_step": -1.0}, "physics_step"),
@@ -197,11 +201,12 @@ def test_the_table_stops_the_arm(mara: RobotModel) -> None:
         ({"physics_step": 0.1}, "must divide"),
         ({"servo_gain": np.nan}, "servo_gain"),
         ({"max_joint_velocity": 0.0}, "max_joint_velocity"),
+        ({"on_divergence": "ignore"}, "on_divergence"),
         ({"gain": 3.0}, "unknown keyword argument 'gain'"),
     ],
 )
-def test_a_bad_setting_is_told(settings: dict[str, Any], said: str) -> None:
-    with pytest.raises(GymMaraError, match=said):
+def test_a_bad_setting_is_an_error(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
         MaraEnv("MARA-v0", backend="mujoco", **settings)
 
 
@@ -210,22 +215,29 @@ def test_a_snapshot_of_other_arms_is_refused(mara: RobotModel) -> None:
         MujocoBackend(mara, 2).restore(MujocoBackend(mara, 3).save())
 
 
-def test_an_arm_that_the_engine_loses_is_told(
+def test_a_state_that_diverges_is_an_error_or_ends_the_episode(
     mara: RobotModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it is
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the working directory
     backend = MujocoBackend(mara, 2)
     snapshot = backend.save()
     snapshot["states"][1] = 1e200
     backend.restore(snapshot)
     with pytest.raises(GymMaraError, match="arm 1 diverged"):
         backend.step(np.zeros((2, 6)))
+    backend = MujocoBackend(mara, 2, on_divergence="truncate")
+    backend.restore(snapshot)
+    state = backend.step(np.full((2, 6), 0.2))
+    assert state.diverged is not None
+    assert state.diverged.tolist() == [False, True]
+    np.testing.assert_array_equal(state.q[1], snapshot["q"][1])
+    assert (backend.step(np.full((2, 6), 0.2)).q > 0.0).all()
 
 
 def test_a_robot_without_inertia_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "massless.urdf"
     path.write_text(SLIDER.replace('<mass value="1"/>', '<mass value="0"/>'))
-    with pytest.raises(GymMaraError, match="MuJoCo does not take the robot 'slider'"):
+    with pytest.raises(GymMaraError, match="MuJoCo cannot load the robot 'slider'"):
         MujocoBackend(RobotModel.from_urdf(path, ee_frame="pole"), 1)
 
 
@@ -237,7 +249,7 @@ def test_an_absent_or_old_mujoco_is_named(monkeypatch: pytest.MonkeyPatch, insta
         importlib.import_module("gym_mara_mujoco")
 
 
-def test_many_arms_are_spread_over_processes_and_move_alike(mara: RobotModel) -> None:
+def test_arms_in_worker_processes_move_as_in_one(mara: RobotModel) -> None:
     alone = MujocoBackend(mara, 4)
     spread = make_backend("mujoco", mara, 4, {"workers": 2})
     try:

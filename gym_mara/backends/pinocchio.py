@@ -63,10 +63,10 @@ class PinocchioBackend(Backend):
             self.joint_velocity = np.full(robot.num_joints, velocity)
         self.path_resolution = positive_number("path_resolution", path_resolution, "m")
         self._checker = make_checker(collision, robot, collision_threads)
-        self._with_room: CollisionChecker | None = None
+        self._with_margin: CollisionChecker | None = None
         if self.max_joint_velocity is not None:
             half = np.full(robot.num_joints, 0.5 * self.max_joint_velocity * self.control_period)
-            self._with_room = self._checker.with_room(half)
+            self._with_margin = self._checker.with_margin(half)
         elif num_envs >= CACHE_FROM and isinstance(
             self._checker, (CoalChecker, ParallelCoalChecker)
         ):
@@ -102,11 +102,11 @@ class PinocchioBackend(Backend):
         length = (np.minimum(np.abs(way), furthest) * self.robot.reach).sum(1)
         samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
         free = np.zeros(self.num_envs, np.bool_)
-        if self._with_room is not None:
+        if self._with_margin is not None:
             # A path is free where the arm, at the middle of it, is far enough from everything.
             long = samples > 1
             middle = self._q[long] + 0.5 * np.clip(way[long], -furthest, furthest)
-            free[long] = ~self._with_room.check(middle)
+            free[long] = ~self._with_margin.check(middle)
             samples[free] = 1
         # The samples of all paths in one array, arm after arm: the arm, and the number of the sample on its path.
         arm = np.repeat(np.arange(self.num_envs), samples)

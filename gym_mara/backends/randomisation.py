@@ -1,4 +1,4 @@
-"""What differs from one arm to the next: ranges of physical parameters, drawn anew for every episode."""
+"""Domain randomisation: ranges of physical parameters, from which each arm draws anew for every episode."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot import RobotModel
-
-Floats = NDArray[np.float64]
+from gym_mara.types import Floats
 
 
 class _Parameter(NamedTuple):
@@ -20,7 +18,7 @@ class _Parameter(NamedTuple):
     positive: bool = False
 
 
-# Scales have no unit; a joint's mass is that of the links it carries up to the next joint.
+# Scales have no unit. The mass of a joint is that of the links between it and the next joint.
 PARAMETERS = {
     "mass": _Parameter(1.0, per_joint=True, positive=True),  # scale of mass and inertia
     "effort_limit": _Parameter(1.0, per_joint=True, positive=True),  # scale
@@ -33,14 +31,14 @@ PARAMETERS = {
 
 
 class Randomisation:
-    """Uniform ranges, from which an arm's parameters are drawn.
+    """Uniform distributions of an arm's parameters.
 
     Args:
         ranges: name → (lowest, highest); the names are those of PARAMETERS.
         robot: the arm.
 
     Raises:
-        GymMaraError: a name is unknown, or a range is out of order or out of its bounds.
+        GymMaraError: a name is unknown, or a range is not (lowest, highest) or not within its bounds.
     """
 
     def __init__(self, ranges: Mapping[str, Sequence[float]], robot: RobotModel) -> None:
@@ -53,14 +51,14 @@ class Randomisation:
         self._num_joints = robot.num_joints
 
     def draw(self, seed: int) -> dict[str, Floats]:
-        """The parameters of one arm: (J,) where each joint has its own, else ()."""
+        """Random parameters of one arm: (J,) for those of each joint, else ()."""
         generator = np.random.default_rng(seed)
         return {
             name: generator.uniform(*self.ranges[name], self._size(name)) for name in self.ranges
         }
 
     def nominal(self) -> dict[str, Floats]:
-        """The same parameters, as they are for an arm before its first episode."""
+        """The same parameters before the first episode: those of the robot."""
         return {name: np.full(self._size(name), PARAMETERS[name].nominal) for name in self.ranges}
 
     def _size(self, name: str) -> tuple[int, ...]:

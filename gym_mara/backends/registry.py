@@ -115,7 +115,7 @@ def make_backend(
     backend, settings = backend_class(name), backend_settings(name)
     for option in options:
         if option not in settings:
-            raise unknown("setting", option, settings, f" of the backend {name!r}")
+            raise unknown("keyword argument", option, settings, f" with backend {name!r}")
     if not backend.in_processes:
         return backend(robot, num_envs, **options)
     options = dict(options)

@@ -19,7 +19,7 @@ from gym_mara.agents.algorithms.registry import (
     preset_names,
 )
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.backends.workers import cores
+from gym_mara.backends.processes import cores
 from gym_mara.cli.common import (
     AlgoOption,
     BackendOption,

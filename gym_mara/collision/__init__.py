@@ -1,4 +1,4 @@
-"""Collision checking: does an arm collide at these configurations? One interface, and the engines behind it."""
+"""Collision checking: whether an arm collides at given configurations. One interface, several engines."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ __all__ = ["CollisionChecker", "make_checker"]
 
 
 def make_checker(name: str, robot: RobotModel, threads: int = 1) -> CollisionChecker:
-    """The checker of this name: "coal", "fcl", or "none", which sees no collision.
+    """The checker of this name: "coal", "fcl", or "none", which finds no collision.
 
     Args:
         name: the engine.
         robot: the arm.
-        threads: how many threads Coal may use for many configurations.
+        threads: how many threads "coal" uses for a batch of configurations; 1 for the other engines.
 
     Raises:
-        GymMaraError: the name is neither, or the engine has no such number of threads.
+        GymMaraError: the name is unknown, or the engine does not support this number of threads.
         MissingExtraError: the engine is not installed.
     """
     if threads < 1 or (threads > 1 and name != "coal"):
         raise GymMaraError(
-            f"collision_threads must be at least 1, and 1 but for 'coal'; not {threads} for {name!r}"
+            f"collision_threads must be at least 1, and exactly 1 unless collision='coal'; "
+            f"not {threads} with {name!r}"
         )
     if name == "coal":
         from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker

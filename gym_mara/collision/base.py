@@ -1,4 +1,4 @@
-"""The contract of a collision checker, and the checker that sees no collision."""
+"""The contract of a collision checker, and the checker that finds no collision."""
 
 from __future__ import annotations
 
@@ -6,30 +6,34 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.robot import RobotModel
+from gym_mara.types import Floats, Mask
 
 
 class CollisionChecker(ABC):
-    """Checks the pairs of links that may collide, the scene's links among them."""
+    """Checks a robot's collision pairs, which include the fixed links around the arm.
+
+    Args:
+        robot: the arm.
+    """
 
     def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
 
     @abstractmethod
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether any pair touches, (N,), at each of the configurations q (N, J), rad."""
+    def check(self, q: Floats) -> Mask:
+        """Whether any pair collides (N,), at each of the configurations q (N, J), rad."""
 
-    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker | None:
-        """A checker for which pairs touch already that could meet while no joint moves further than `displacement` (J,), rad.
+    def with_margin(self, displacement: Floats) -> CollisionChecker | None:
+        """A checker that reports pairs that could meet while no joint moves by more than `displacement` (J,), rad.
 
-        None where the engine cannot tell.
+        None if the engine has no such checker.
         """
         return None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Engines' objects do not pickle; the robot says it all.
+        # The engines' objects do not pickle; a copy is built anew from the robot.
         return type(self), (self.robot,)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CollisionChecker:
@@ -39,10 +43,10 @@ class CollisionChecker(ABC):
 
 
 class NoChecker(CollisionChecker):
-    """Sees no collision, and costs nothing."""
+    """Finds no collision, at no cost."""
 
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def check(self, q: Floats) -> Mask:
         return np.zeros(len(q), dtype=np.bool_)
 
-    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+    def with_margin(self, displacement: Floats) -> CollisionChecker:
         return self

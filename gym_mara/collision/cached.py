@@ -1,59 +1,61 @@
-"""A checker that skips the checks of arms that have stayed where nothing is near."""
+"""A collision checker for large batches: it skips arms that stay near a configuration known to be free all around."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
 from gym_mara.robot import RobotModel
+from gym_mara.types import Floats, Mask
 
 
 class CachedChecker(CollisionChecker):
-    """Spares the checks of arms that stay where there is known to be room around them; the answers are the same.
+    """Gives the same answers as the exact checker, with fewer checks when arms stay in place.
 
-    For many arms, each always in the same row, as a policy keeps them that has learnt where to go: where nothing can touch
-    while no joint moves further than NEARBY, nothing needs to be checked while none does.
+    Each arm must always be in the same row. If nothing can collide while no joint moves by more than RADIUS from a
+    configuration, the arm is not checked again while its joints stay that close to it. This saves most checks once a
+    policy has learnt to hold a pose.
 
     Args:
         robot: the arm.
-        exact: what checks the others.
+        exact: checks the other arms.
     """
 
-    NEARBY = 0.01
+    RADIUS = 0.01
     """rad (m for a prismatic joint)."""
 
     def __init__(self, robot: RobotModel, exact: CoalChecker | ParallelCoalChecker) -> None:
         super().__init__(robot)
         self._exact = exact
-        self._with_room = CoalChecker(robot, np.full(robot.num_joints, self.NEARBY))
-        # Per arm: where it was last, where it was last looked for room, and where room was found; NaN is near nothing.
-        self._last: NDArray[np.float64] = np.empty((0, robot.num_joints))
-        self._looked = self._free = self._last
+        self._with_margin = CoalChecker(robot, np.full(robot.num_joints, self.RADIUS))
+        # For each arm: its last configuration, the last one checked with the margin, and the one known to be free all
+        # around. NaN is near nothing.
+        self._last: Floats = np.empty((0, robot.num_joints))
+        self._tested = self._free = self._last
 
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def check(self, q: Floats) -> Mask:
         if len(q) != len(self._last):
             self._last = np.full(q.shape, np.nan)
-            self._looked, self._free = self._last.copy(), self._last.copy()
+            self._tested, self._free = self._last.copy(), self._last.copy()
         collided = np.zeros(len(q), dtype=np.bool_)
         unsure = ~self._near(q, self._free)
         if unsure.any():
             collided[unsure] = self._exact.check(q[unsure])
-            # Only arms that stay about are worth a look, and only one look at each place.
+            # The check with the margin pays only for arms that stay in place, and once in each place.
             stays = unsure & ~collided & self._near(q, self._last)
-            look = np.flatnonzero(stays & ~self._near(q, self._looked))
-            if len(look):
-                self._looked[look] = q[look]
-                roomy = look[~self._with_room.check(q[look])]
-                self._free[roomy] = q[roomy]
+            test = np.flatnonzero(stays & ~self._near(q, self._tested))
+            if len(test):
+                self._tested[test] = q[test]
+                free = test[~self._with_margin.check(q[test])]
+                self._free[free] = q[free]
         self._last = q.copy()
         return collided
 
-    def _near(self, q: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray((np.abs(q - place) <= self.NEARBY).all(axis=1))
+    def _near(self, q: Floats, other: Floats) -> Mask:
+        return np.asarray((np.abs(q - other) <= self.RADIUS).all(axis=1))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._exact)

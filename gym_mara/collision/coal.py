@@ -1,4 +1,4 @@
-"""Coal, the collision library that comes with Pinocchio: on one thread, on several, and which links touch."""
+"""Collision checking by Coal, the library that comes with Pinocchio: on one thread or several, and which links touch."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.robot import RobotModel
+from gym_mara.types import Floats, Mask
 
 
 class CoalChecker(CollisionChecker):
-    """Coal, FCL's successor that Pinocchio ships, one configuration at a time.
+    """Coal, the successor of FCL, one configuration at a time.
 
-    Its plainest broad phase is the fastest here: an arm has too few bodies for a tree of their boxes to pay.
+    It uses the naive broad phase, which measured fastest: an arm has too few bodies for a tree of bounding boxes to pay.
 
     Args:
         robot: the arm.
-        displacement: how far each joint may move (J,), rad: pairs count as touching that could meet while none moves
-            further. None for pairs that touch.
+        displacement: how far each joint may move (J,), rad. The checker then reports pairs that could meet while no joint
+            moves by more than this. None to report pairs that touch.
     """
 
-    def __init__(self, robot: RobotModel, displacement: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, robot: RobotModel, displacement: Floats | None = None) -> None:
         super().__init__(robot)
         self._displacement = displacement
-        # The manager refers to what it is given, and does not keep it alive.
+        # The manager holds references to its arguments without keeping them alive.
         self._data, self._geometry_data = robot.model.createData(), robot.geometry.createData()
         if displacement is not None:
             margins = approach_bounds(robot, displacement).tolist()
@@ -36,7 +36,7 @@ class CoalChecker(CollisionChecker):
             robot.model, robot.geometry, self._geometry_data
         )
 
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def check(self, q: Floats) -> Mask:
         model, data, manager, check = (
             self.robot.model,
             self._data,
@@ -45,17 +45,17 @@ class CoalChecker(CollisionChecker):
         )
         return np.array([check(model, data, manager, row, True) for row in q], dtype=np.bool_)
 
-    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+    def with_margin(self, displacement: Floats) -> CollisionChecker:
         return CoalChecker(self.robot, displacement)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._displacement)
 
 
-def approach_bounds(robot: RobotModel, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much nearer the two ends of each collision pair can come (P,), m, while joints move by `displacement` (J,), rad.
+def approach_bounds(robot: RobotModel, displacement: Floats) -> Floats:
+    """By how much the distance of each collision pair can shrink (P,), m, while joints move by `displacement` (J,), rad.
 
-    Seen from one end, only the joints between the two move the other.
+    Only the joints between the two links of a pair move one relative to the other.
     """
     model, objects = robot.model, robot.geometry.geometryObjects
     joints_to: list[frozenset[int]] = [frozenset()]
@@ -70,33 +70,37 @@ def approach_bounds(robot: RobotModel, displacement: NDArray[np.float64]) -> NDA
 
 
 class ParallelCoalChecker(CollisionChecker):
-    """Coal with a broad phase per thread.
+    """Coal on several threads, each with a broad phase of its own.
 
-    Worth it for large batches on several idle cores: on a busy one the threads wait for each other, and a process that
-    has used them must not fork.
+    It pays for large batches on several idle cores; on busy cores the threads wait for each other. A process that has used
+    it must not fork.
+
+    Args:
+        robot: the arm.
+        threads: how many.
     """
 
     def __init__(self, robot: RobotModel, threads: int) -> None:
         super().__init__(robot)
         self._threads = threads
-        # The only broad phase that Pinocchio spreads over threads.
+        # The only broad phase that Pinocchio runs on several threads.
         self._pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(
             robot.model, robot.geometry, threads
         )
 
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def check(self, q: Floats) -> Mask:
         result = pin.computeCollisionsInParallel(self._threads, self._pool, q.T, True, False)
         return np.asarray(result, dtype=np.bool_).reshape(len(q))
 
-    def with_room(self, displacement: NDArray[np.float64]) -> CollisionChecker:
+    def with_margin(self, displacement: Floats) -> CollisionChecker:
         return CoalChecker(self.robot, displacement)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._threads)
 
 
-def touching_links(robot: RobotModel, q: NDArray[np.float64]) -> frozenset[str]:
-    """The links that touch another at a configuration q (J,), rad, of the pairs that may collide."""
+def touching_links(robot: RobotModel, q: Floats) -> frozenset[str]:
+    """The links of the collision pairs that touch at a configuration q (J,), rad."""
     data = robot.geometry.createData()
     pin.computeCollisions(robot.model, robot.model.createData(), robot.geometry, data, q, False)
     touching: set[str] = set()

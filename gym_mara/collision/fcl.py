@@ -1,4 +1,4 @@
-"""The collision checker on python-fcl: pair by pair, an independent referee for the one on Coal."""
+"""The collision checker on python-fcl, pair by pair: an independent check of the one on Coal."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
-from gym_mara.robot.model import RobotModel
+from gym_mara.robot import RobotModel
+from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.types import Floats, Mask
 
 with needs("the collision engine 'fcl'", "fcl"):
     import fcl
@@ -19,22 +20,31 @@ with needs("the collision engine 'fcl'", "fcl"):
 
 
 class FclChecker(CollisionChecker):
-    """python-fcl: boxes, cylinders, spheres and capsules as such, meshes as triangles."""
+    """python-fcl, with meshes as sets of triangles.
+
+    Args:
+        robot: the arm.
+
+    Raises:
+        GymMaraError: the robot has a shape that python-fcl does not support.
+        MissingExtraError: python-fcl is not installed.
+    """
 
     def __init__(self, robot: RobotModel) -> None:
         super().__init__(robot)
         self._data = robot.model.createData()
         self._geometry_data = robot.geometry.createData()
-        objects = robot.geometry.geometryObjects
-        self._objects = [fcl.CollisionObject(_shape(o)) for o in objects]
+        self._objects = [
+            fcl.CollisionObject(_geometry(robot, index)) for index in range(robot.geometry.ngeoms)
+        ]
         self._pairs = [(p.first, p.second) for p in robot.geometry.collisionPairs]
         self._moving = sorted({index for pair in self._pairs for index in pair})
         self._request = fcl.CollisionRequest(num_max_contacts=1)
 
-    def check(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def check(self, q: Floats) -> Mask:
         return np.fromiter((self._collides(row) for row in q), dtype=np.bool_, count=len(q))
 
-    def _collides(self, q: NDArray[np.float64]) -> bool:
+    def _collides(self, q: Floats) -> bool:
         robot = self.robot
         pin.updateGeometryPlacements(
             robot.model, self._data, robot.geometry, self._geometry_data, q
@@ -48,26 +58,25 @@ class FclChecker(CollisionChecker):
         )
 
 
-def _shape(geometry_object: pin.GeometryObject) -> Any:
-    """python-fcl's shape of one of Pinocchio's geometry objects."""
-    shape = geometry_object.geometry
-    kind = type(shape).__name__
-    if kind == "Box":
-        return fcl.Box(*(2.0 * shape.halfSide))
-    if kind == "Cylinder":
-        return fcl.Cylinder(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Capsule":
-        return fcl.Capsule(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Sphere":
-        return fcl.Sphere(shape.radius)
-    if kind.startswith("BVHModel"):
-        mesh = trimesh.load_mesh(geometry_object.meshPath)
-        model = fcl.BVHModel()
-        model.beginModel(len(mesh.vertices), len(mesh.faces))
-        model.addSubModel(mesh.vertices * geometry_object.meshScale, mesh.faces)
-        model.endModel()
-        return model
+def _geometry(robot: RobotModel, index: int) -> Any:
+    """python-fcl's geometry of one of the robot's shapes."""
+    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
+        case Box(size):
+            return fcl.Box(*size)
+        case Sphere(radius):
+            return fcl.Sphere(radius)
+        case Cylinder(radius, length):
+            return fcl.Cylinder(radius, length)
+        case Capsule(radius, length):
+            return fcl.Capsule(radius, length)
+        case Mesh(path, scale, convex=False):
+            mesh = trimesh.load_mesh(path)
+            model = fcl.BVHModel()
+            model.beginModel(len(mesh.vertices), len(mesh.faces))
+            model.addSubModel(mesh.vertices * scale, mesh.faces)
+            model.endModel()
+            return model
     raise GymMaraError(
-        f"the collision engine 'fcl' does not know the shape {kind} of {geometry_object.name!r}; "
+        f"the collision engine 'fcl' does not support the convex hull of link {robot.link_of(index)!r}; "
         "use collision='coal'"
     )

@@ -40,8 +40,8 @@ class GazeboMaraEnv(MaraEnv):
         gui: show the arm in the browser; flag -g of gym-gazebo2's scripts.
         real_speed: joints move with a limited speed, and do not jump to their targets; flag -r.
         velocity: the joint speed with real_speed, rad/s; flag -v.
-        original_observation: whether the observation has J(q)·q, the Jacobian times the joint positions, in place of the
-            end effector's velocity J(q)·q̇. gym-gazebo2 has this error.
+        original_observation: whether the observation has J(q)·q, the Jacobian times the joint positions, in place of
+            the end effector's velocity J(q)·q̇. gym-gazebo2 has this error.
         **options: as in MaraEnv.
 
     Raises:
@@ -99,7 +99,7 @@ class GazeboMaraEnv(MaraEnv):
 
 
 def _position_for_velocity(robot: RobotModel) -> Part:
-    """The part that gym-gazebo2 has in place of the end effector's velocity: J(q)·q, the Jacobian times the joint positions."""
+    """gym-gazebo2's replacement of the end effector's velocity: J(q)·q, the Jacobian times the joint positions."""
     # |J(q)·q| is at most the sum over the joints of reach times largest angle.
     farthest = float((robot.reach * np.maximum(-robot.lower, robot.upper)).sum())
     bound = np.full(3, farthest)

@@ -1,4 +1,4 @@
-"""The environments: one arm, many arms in one batch, an arm with goals."""
+"""The environments: one arm, a batch of arms, and one arm with goals for hindsight replay."""
 
 from gym_mara.envs.goal import MaraGoalEnv
 from gym_mara.envs.single import MaraEnv

@@ -1,4 +1,4 @@
-"""MaraGoalEnv: the arm in the form of Gymnasium-Robotics' goal environments, for algorithms such as hindsight replay."""
+"""MaraGoalEnv: a goal environment in the format of Gymnasium-Robotics, for algorithms such as hindsight replay."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ REWARD_TYPES = ("sparse", "dense")
 
 
 class MaraGoalEnv(MaraEnv):
-    """One arm whose goal can be exchanged afterwards.
+    """One arm; the reward of a step can be computed again for another goal.
 
-    The observation is a dictionary: `observation`, joint positions (J,), rad, and the tool's velocity (3,), m/s;
-    `achieved_goal` and `desired_goal`, the tool's and the target's position (3,), m, followed by their quaternions (4,),
-    [w, x, y, z], where the orientation counts. `info` also has `is_success`.
+    The observation is a dictionary. `observation` holds the joint positions (J,), rad, and the velocity of the end
+    effector (3,), m/s. `achieved_goal` and `desired_goal` hold the positions (3,), m, of the end effector and of the
+    target. If the task has `orientation`, their quaternions (4,), [w, x, y, z], follow. `info` also has `is_success`.
 
     Args:
         task: the name of a reach task, or a ReachTask.
-        reward_type: "sparse": 0 within the tolerances, else -1; or "dense": the task's reward.
-        position_tolerance: m.
-        angle_tolerance: rad; it counts where the orientation does.
-        **options: as of MaraEnv.
+        reward_type: "sparse" for 0 within the tolerances and -1 elsewhere, or "dense" for the task's reward.
+        position_tolerance: the largest distance to the target that is a success, m.
+        angle_tolerance: the largest angle to the target that is a success, rad; used if the task has `orientation`.
+        **options: as in MaraEnv.
 
     Raises:
-        GymMaraError: a name is unknown, a value is out of its range, or the task is no reach task.
+        GymMaraError: a name is unknown, a value is out of its range, or the task is not a reach task.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class MaraGoalEnv(MaraEnv):
         self.angle_tolerance = positive_number("angle_tolerance", angle_tolerance, "rad")
         super().__init__(task, **options)
         if not isinstance(self.simulation.task, ReachTask):
-            raise GymMaraError(f"a goal environment wants a reach task, not {task!r}")
+            raise GymMaraError(f"a goal environment needs a reach task, not {task!r}")
         self.task = self.simulation.task
         robot, backend = self.simulation.robot, self.simulation.backend
         self._groups: dict[str, list[Part]] = {
@@ -84,10 +84,10 @@ class MaraGoalEnv(MaraEnv):
     def step(  # type: ignore[override]
         self, action: NDArray[np.float32]
     ) -> tuple[dict[str, Floats], float, bool, bool, dict[str, Any]]:
-        """Move towards the joint targets (J,), rad, for one control period.
+        """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
+            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
         """
         flat, _, terminated, truncated, info = super().step(action)
         goals = self._as_goals(flat)
@@ -97,15 +97,15 @@ class MaraGoalEnv(MaraEnv):
         return goals, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
-        """The rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
 
         Args:
-            achieved_goal: where the tool is.
-            desired_goal: where it was to be.
-            info: a step's, or a sequence of as many; the task's collision penalty reads `collided` there.
+            achieved_goal: the poses of the end effector.
+            desired_goal: the target poses.
+            info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
 
         Raises:
-            GymMaraError: the reward wants to know of collisions, and the info does not say.
+            GymMaraError: the task has a collision penalty, and an info has no `collided`.
         """
         if self.reward_type == "sparse":
             return self._succeeds(achieved_goal, desired_goal) - 1.0
@@ -115,7 +115,7 @@ class MaraGoalEnv(MaraEnv):
             infos = [info] if isinstance(info, Mapping) else list(info)
             if not all("collided" in one for one in infos):
                 raise GymMaraError(
-                    "the collision penalty needs each step's info: HerReplayBuffer(copy_info_dict=True)"
+                    "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
                 )
             collided = np.array([one["collided"] for one in infos])
         position, quaternion = self._parts(achieved)
@@ -123,11 +123,11 @@ class MaraGoalEnv(MaraEnv):
         return reward.reshape(np.shape(achieved_goal)[:-1])
 
     def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """Never: an episode goes on at its goal."""
+        """False: an episode continues after the goal is reached."""
         return False
 
     def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """Never by the goal."""
+        """False: a goal truncates no episode."""
         return False
 
     def _succeeds(self, achieved: Floats, desired: Floats) -> Any:
@@ -139,13 +139,13 @@ class MaraGoalEnv(MaraEnv):
         return near
 
     def _parts(self, goal: Floats) -> tuple[Floats, Floats]:
-        """Positions (N, 3) and quaternions (N, 4) of goals (N, G)."""
+        """The positions (N, 3) and the quaternions (N, 4) of goals (N, G)."""
         if self.task.orientation:
             return goal[:, :3], goal[:, 3:]
         return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
 
     def _as_goals(self, flat: Floats) -> dict[str, Floats]:
-        """The flat observation (O,) as a dictionary."""
+        """Convert the flat observation (O,) to the dictionary."""
         values = self.simulation.observation.split(flat)
         return {
             name: np.concatenate([values[part.name] for part in parts])

@@ -1,4 +1,4 @@
-"""The keyword arguments of the environments, sorted once into those of each room."""
+"""Assigns the keyword arguments of an environment to the task, the backend, the sensors and the rendering."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gym_mara.tasks import Task, named_task
 
 @dataclass(frozen=True)
 class Options:
-    """What an environment is made of."""
+    """The task, the robot, the backend and the settings of an environment."""
 
     task: Task
     robot: RobotModel
@@ -36,17 +36,17 @@ class Options:
         backend: str,
         keywords: dict[str, Any],
     ) -> Options:
-        """Give each room its own keyword arguments.
+        """Assign each keyword argument to the part of the environment that knows its name.
 
         Args:
             task: the name of a task, or a task.
             robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
             ee_frame: the end-effector link of a URDF of your own.
             backend: the name of a backend.
-            keywords: values of the task, settings of the backend, of the sensors and of rendering.
+            keywords: values of the task, and settings of the backend, the sensors and the rendering.
 
         Raises:
-            GymMaraError: a name is unknown, or a value is out of its range.
+            GymMaraError: a name is unknown or belongs to two parts, or a value is out of its range.
             MissingExtraError: a library is not installed.
         """
         chosen = named_task(task)

@@ -1,7 +1,8 @@
-"""Sensors: the joint encoders' noise, between the state and its observation."""
+"""Sensors: joint encoders whose noise lies between the state and the observation."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -17,31 +18,31 @@ from gym_mara.types import Floats, Mask
 
 @dataclasses.dataclass(frozen=True)
 class SensorSettings:
-    """What a user may choose of the sensors; each is a keyword argument of the environments.
+    """The settings of the sensors; each is a keyword argument of the environments.
 
     Raises:
         GymMaraError: a value is out of its range.
     """
 
     velocity_filter: float = 0.0
-    """The time constant of the low-pass filter of measured velocities, s; 0 for none."""
+    """The time constant of the low-pass filter for measured velocities, s; 0 for no filter."""
 
     def __post_init__(self) -> None:
         positive_number("velocity_filter", self.velocity_filter, "s", or_zero=True)
 
 
 class Sensors:
-    """The encoders of N arms: positions with Gaussian noise, velocities by finite differences of these.
+    """The encoders of N arms: positions with Gaussian noise, and velocities as finite differences of these.
 
-    Measured values are clipped to the limits of the joints. The end effector's pose and velocity are those of the
-    measured joints. The first measurement of an episode is of an arm at rest.
+    Measured values are clipped to the joint limits. The pose and the velocity of the end effector are computed from the
+    measured joint values. The first measurement of an episode has velocity zero.
 
     Args:
         robot: the arm.
         num_envs: N.
-        period: between two measurements, s.
-        joint_velocity: how fast the joints can be (J,), rad/s.
-        settings: what the user has chosen.
+        period: the time between two measurements, s.
+        joint_velocity: the largest speed of each joint (J,), rad/s.
+        settings: the settings of the sensors.
     """
 
     def __init__(
@@ -54,32 +55,39 @@ class Sensors:
     ) -> None:
         self._robot, self._period, self._joint_velocity = robot, period, joint_velocity
         self._kinematics = robot.kinematics()
-        # An exponential filter in discrete time: v += (1 - e^(-T/τ)) (difference/T - v).
+        # An exponential filter in discrete time, with period T: v += (1 - e^(-T/τ)) (difference/T - v).
         filtered = settings.velocity_filter
         self._weight = 1.0 - np.exp(-period / filtered) if filtered else 1.0
         self._q = np.zeros((num_envs, robot.num_joints))
         self._qd = np.zeros_like(self._q)
+        # The noise of each arm's episode. A new episode has a new generator, so that it does not depend on how many steps
+        # the last one had: a vector environment also steps arms whose episodes have ended.
+        self._generators: dict[int, np.random.Generator] = {}
 
-    def begin(self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask) -> None:
-        """Measure the chosen arms, which were put at rest at q (N, J), rad.
+    def begin_episodes(self, streams: Sequence[Streams], arms: Mask) -> None:
+        """Seed the noise of the chosen arms (N,) from their random generators."""
+        for arm in np.flatnonzero(arms).tolist():
+            self._generators[arm] = np.random.default_rng(streams[arm].sensors.integers(2**63))
+
+    def begin(self, q: Floats, noise: Floats, arms: Mask) -> None:
+        """Take the first measurement of the chosen arms, which are at rest.
 
         Args:
-            q: the configurations (N, J), rad; the rows of other arms do not count.
+            q: the joint positions (N, J), rad; only the rows of the chosen arms are used.
             noise: the standard deviation of each arm's measured positions (N,), rad.
-            streams: each arm's sources of randomness.
-            arms: which arms.
+            arms: the chosen arms (N,).
         """
-        self._q[arms] = self._positions(q, noise, streams, arms)[arms]
+        self._q[arms] = self._positions(q, noise, arms)[arms]
         self._qd[arms] = 0.0
 
-    def measure(self, q: Floats, noise: Floats, streams: Sequence[Streams]) -> None:
-        """Measure all arms one period after their last measurement; the arguments are those of `begin`."""
-        measured = self._positions(q, noise, streams, np.ones(len(q), np.bool_))
+    def measure(self, q: Floats, noise: Floats) -> None:
+        """Measure all arms, one period after their last measurement. The arguments are as in `begin`."""
+        measured = self._positions(q, noise, np.ones(len(q), np.bool_))
         self._qd += self._weight * ((measured - self._q) / self._period - self._qd)
         self._q = measured
 
     def seen(self, state: SimState) -> SimState:
-        """A state as the last measurements show it."""
+        """Replace the joint and end-effector values of a state with the last measurements."""
         q = self._q.copy()
         qd = self._qd.clip(-self._joint_velocity, self._joint_velocity)
         position, quaternion = self._kinematics.pose(q)
@@ -92,18 +100,18 @@ class Sensors:
             ee_velocity=self._kinematics.velocity(q, qd),
         )
 
-    def _positions(
-        self, q: Floats, noise: Floats, streams: Sequence[Streams], arms: Mask
-    ) -> Floats:
+    def _positions(self, q: Floats, noise: Floats, arms: Mask) -> Floats:
         measured = q.copy()
         for arm in np.flatnonzero(arms).tolist():
-            measured[arm] += noise[arm] * streams[arm].sensors.standard_normal(q.shape[1])
+            measured[arm] += noise[arm] * self._generators[arm].standard_normal(q.shape[1])
         return measured.clip(self._robot.lower, self._robot.upper)
 
     def save(self) -> dict[str, Any]:
-        """A snapshot."""
-        return {"q": self._q.copy(), "qd": self._qd.copy()}
+        """A snapshot of the last measurements and of the noise."""
+        return copy.deepcopy({"q": self._q, "qd": self._qd, "generators": self._generators})
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot."""
-        self._q, self._qd = snapshot["q"].copy(), snapshot["qd"].copy()
+        """Restore a snapshot."""
+        snapshot = copy.deepcopy(snapshot)
+        self._q, self._qd = snapshot["q"], snapshot["qd"]
+        self._generators = snapshot["generators"]

@@ -28,24 +28,25 @@ class Outcome(NamedTuple):
     """The result of one step, per arm."""
 
     observation: Floats
-    """(N, O); where an arm collided, of the colliding pose."""
+    """The observations (N, O); for an arm that collided, from its colliding configuration."""
     reward: Floats
-    """(N,)."""
+    """The rewards (N,)."""
     terminated: Mask
-    """(N,)."""
+    """Whether the episode terminated (N,)."""
     truncated: Mask | None
-    """The arms (N,) whose state diverged, if any."""
+    """Whether the arm's state diverged (N,); None if no arm's did."""
     info: dict[str, NDArray[Any]]
-    """The task's reward terms, `collided`, each (N,), and what the state tells beyond the task's terms, (N, …)."""
+    """The task's reward terms and `collided`, each (N,); torques, contacts and random parameters, each (N, …), if the
+    state has them."""
     state: SimState
-    """The state that was judged; where an arm collided, of the colliding pose."""
+    """The state that the task rewarded; for an arm that collided, its colliding configuration."""
 
 
 class Simulation:
     """N arms of one robot, moved by one backend, judged by one task.
 
     Args:
-        options: what it is made of.
+        options: the task, the robot, the backend and their settings.
         num_envs: N.
 
     Raises:
@@ -66,31 +67,36 @@ class Simulation:
         self._started = False
         self._closed = False
         self.outcome: Outcome | None = None
-        """That of the last step."""
-        # The arms that have begun an episode since the last step.
+        """The outcome of the last step."""
+        # The arms that began an episode after the last step.
         self._began = np.zeros(self.num_envs, np.bool_)
         self.statistics = EpisodeStatistics(self.num_envs)
         self.streams: Sequence[Streams] = ()
-        """Each arm's sources of randomness; needed where `random` is true."""
+        """The random generators of each arm; needed if `random` is true."""
+        if options.sensors.velocity_filter and _sensor_noise(self.backend.state) is None:
+            raise GymMaraError(
+                "velocity_filter smooths the velocity of noisy sensors: "
+                "also give randomisation={'sensor_noise': (lowest, highest)}, or leave it out"
+            )
         self._sensors = self._new_sensors()
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
         )
         self.action_space = Box(-np.pi, np.pi, (self.robot.num_joints,), np.float32)
-        # The joint targets that can come about: within the action space and the joint limits, rad.
+        # The range of joint targets: the intersection of the action space and the joint limits, rad.
         self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
         self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
 
     @property
     def random(self) -> bool:
-        """Whether episodes differ, so that `reset` needs `streams`."""
+        """Whether episodes have random parameters or goals, so that `reset` needs `streams`."""
         return self.backend.random or self.task.random_goal
 
     def reset(self, mask: Mask | None = None) -> tuple[Floats, dict[str, NDArray[Any]]]:
-        """Begin new episodes, of all arms or of those that the mask (N,) chooses.
+        """Begin new episodes of all arms, or of the arms that the mask (N,) selects.
 
         Returns:
-            The observations (N, O), and what the state tells beyond the task's terms, each (N, …).
+            The observations (N, O); and torques, contacts and random parameters, each (N, …), if the state has them.
         """
         self._check_open()
         chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
@@ -112,15 +118,17 @@ class Simulation:
         state = self.backend.state
         noise = _sensor_noise(state)
         if noise is not None:
-            self._sensors.begin(self._start, noise, self.streams, chosen)
+            self._sensors.begin_episodes(self.streams, chosen)
+            self._sensors.begin(self._start, noise, chosen)
         return self._observe(state), _report(state)
 
     def step(self, action: ArrayLike) -> Outcome:
-        """Move every arm for one control period towards its joint targets (N, J), rad.
+        """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite; nothing has moved then.
-            ResetNeeded, ClosedEnvironmentError: the environment was not reset, or is closed.
+            GymMaraError: the action has the wrong shape or is not finite. No arm moves then.
+            ResetNeeded: the environment was not reset.
+            ClosedEnvironmentError: the environment is closed.
         """
         self._check_open()
         if not self._started:
@@ -129,7 +137,7 @@ class Simulation:
         self._began.fill(False)
         noise = _sensor_noise(state)
         if noise is not None:
-            self._sensors.measure(state.q, noise, self.streams)
+            self._sensors.measure(state.q, noise)
         observation = self._observe(state)
         reward, terms = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
@@ -139,7 +147,7 @@ class Simulation:
         elif self.task.on_collision == "reset" and (count := np.count_nonzero(collided)):
             self.backend.reset(self._start, None if count == self.num_envs else collided)
             if noise is not None:
-                self._sensors.begin(self._start, noise, self.streams, collided)
+                self._sensors.begin(self._start, noise, collided)
         distance = terms["distance"] if "distance" in terms else np.full(self.num_envs, np.nan)
         self.statistics.add(distance, reward, collided)
         diverged = state.diverged
@@ -149,14 +157,14 @@ class Simulation:
         return self.outcome
 
     def observed(self, arm: int) -> SimState:
-        """The state that an arm's last observation is of: where it collided and was put back, the colliding one."""
+        """The state of an arm's last observation: after a collision, the colliding state, even if the arm was reset."""
         self._check_open()
         if self.outcome is None or self._began[arm]:
             return self.backend.state
         return self.outcome.state
 
     def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
-        """Move the goal of every arm to a position (3,), m, and a unit quaternion (4,), [w, x, y, z]."""
+        """Set the goal of every arm to a position (3,), m, and a quaternion (4,), [w, x, y, z], which is normalised."""
         quaternion = rotations.normalised(np.asarray(quaternion, np.float64))
         quaternion = rotations.canonical(quaternion)
         shape = (self.num_envs, 1)
@@ -165,7 +173,9 @@ class Simulation:
         )
 
     def switch_backend(self, name: str) -> None:
-        """Go on in another backend, at rest where the joints are; it keeps those settings that it knows.
+        """Continue in another backend, at rest at the current joint positions.
+
+        The new backend receives those of the user's settings that it knows.
 
         Raises:
             GymMaraError: the name is unknown.
@@ -178,7 +188,7 @@ class Simulation:
         everyone = np.ones(self.num_envs, np.bool_)
         if backend.random:
             if not self._started:
-                raise ResetNeeded("call reset() before the backend is switched")
+                raise ResetNeeded("call reset() before you switch the backend")
             seeds = [stream.backends.integers(2**63) for stream in self.streams]
             backend.begin_episodes(np.array(seeds, np.uint64), everyone)
         q = self.backend.state.q.clip(self.robot.lower, self.robot.upper)
@@ -188,7 +198,8 @@ class Simulation:
         self._sensors = self._new_sensors()
         noise = _sensor_noise(backend.state)
         if noise is not None:
-            self._sensors.begin(q, noise, self.streams, everyone)
+            self._sensors.begin_episodes(self.streams, everyone)
+            self._sensors.begin(q, noise, everyone)
 
     def _new_sensors(self) -> Sensors:
         backend = self.backend
@@ -201,13 +212,13 @@ class Simulation:
         )
 
     def _observe(self, state: SimState) -> Floats:
-        """The observations (N, O) of a state, which the sensors have measured where they are noisy."""
+        """The observations (N, O) of a state, from the noisy measurements if there is sensor noise."""
         if _sensor_noise(state) is not None:
             state = self._sensors.seen(state)
         return self.observation(state, self.goal)
 
     def _target(self, action: ArrayLike) -> Floats:
-        """The joint targets that an action asks for, clipped to the action space and the joint limits."""
+        """The joint targets of an action, clipped to the action space and the joint limits."""
         try:
             target = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -215,11 +226,11 @@ class Simulation:
         if target.shape != self._start.shape:
             raise GymMaraError(
                 f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
-                f"{self.robot.name} wants {self._start.shape[1:] if self.num_envs == 1 else self._start.shape}"
+                f"{self.robot.name} needs {self._start.shape[1:] if self.num_envs == 1 else self._start.shape}"
             )
         if np.count_nonzero(np.isfinite(target)) < target.size:
             raise GymMaraError(
-                "the action holds NaN or infinity; joint targets must be finite (rad)"
+                "the action contains NaN or infinity; joint targets must be finite (rad)"
             )
         return target.clip(self.target_low, self.target_high)
 
@@ -228,7 +239,7 @@ class Simulation:
             raise ClosedEnvironmentError("the environment is closed; make a new one")
 
     def save(self) -> dict[str, Any]:
-        """A snapshot of the arms, the sensors, the random streams and the episodes' statistics."""
+        """A snapshot of the arms, the sensors, the random generators, the goals and the statistics of the episodes."""
         return {
             "backend": self.backend.save(),
             "statistics": copy.deepcopy(self.statistics),
@@ -239,7 +250,7 @@ class Simulation:
         }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot."""
+        """Restore a snapshot."""
         self._check_open()
         self.backend.restore(snapshot["backend"])
         self.statistics = copy.deepcopy(snapshot["statistics"])
@@ -250,19 +261,19 @@ class Simulation:
         self.goal = Goal(*(values.copy() for values in snapshot["goal"]))
 
     def close(self) -> None:
-        """Free the backend; closing twice does no harm."""
+        """Free the backend. A second call has no effect."""
         if not self._closed:
             self._closed = True
             self.backend.close()
 
 
 def _sensor_noise(state: SimState) -> Floats | None:
-    """The standard deviation of each arm's measured joint positions (N,), rad, where it was drawn."""
+    """The standard deviation of each arm's measured joint positions (N,), rad; None without sensor noise."""
     return None if state.parameters is None else state.parameters.get("sensor_noise")
 
 
 def _report(state: SimState) -> dict[str, NDArray[Any]]:
-    """What `info` reports of a state beyond the task's terms, each (N, …)."""
+    """The torques, contacts and random parameters of a state, for `info`, each (N, …)."""
     report: dict[str, NDArray[Any]] = {}
     if state.torque is not None:
         report["joint_torque"] = state.torque

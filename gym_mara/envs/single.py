@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     """One arm.
 
-    The observation is the task's, (O,); the action holds absolute joint targets (J,), rad. `info` carries the terms of
-    the reward, `collided`, and `statistics`, those of the episode so far (`gym_mara.envs.statistics`).
+    The task defines the observation (O,). An action is an array of absolute joint targets (J,), rad. `info` has the
+    terms of the reward, `collided`, and the `statistics` of the episode so far (`gym_mara.envs.statistics`).
 
     Args:
         task: the name of a task, such as "MARA-v0", or a Task.
@@ -37,7 +37,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         backend: the name of a backend.
         render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
         **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
-            (`max_joint_velocity`, …), of the sensors (`velocity_filter`) and of pictures (`width`, `camera`, …;
+            (`max_joint_velocity`, …), of the sensors (`velocity_filter`) and of the rendering (`width`, `camera`, …;
             `gym_mara.rendering.RenderSettings`).
 
     Raises:
@@ -45,7 +45,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         MissingExtraError: a library is not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012 - Gymnasium's form
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"]}  # noqa: RUF012 - Gymnasium defines it so
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.simulation = Simulation(self._options, 1)
         self._pictures = Pictures(self.simulation.robot, self._options.rendering)
         self.viewer: Viewer | None = None
-        # The generator that the simulation's streams were spawned from.
+        # The generator from which the simulation's streams were spawned.
         self._spawned_from: np.random.Generator | None = None
         self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
         self.action_space = self.simulation.action_space
@@ -71,7 +71,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start pose; `options` has no meaning yet."""
+        """Begin an episode at the start configuration; `options` is not used."""
         super().reset(seed=seed)
         if self._spawned_from is not self.np_random:
             self._spawned_from = self.np_random
@@ -82,36 +82,38 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return observation[0], _info_of_one(report)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Move towards the joint targets (J,), rad, for one control period.
+        """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite; the arm has not moved then.
+            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
         """
         outcome = self._advance(np.asarray(action)[None])
         info = _info_of_one(outcome.info)
-        # At every step: Gymnasium does not tell an environment when its TimeLimit ends the episode.
+        # At every step, because an environment does not know when Gymnasium's TimeLimit truncates its episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
         return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
 
     def _advance(self, targets: NDArray[Any]) -> Outcome:
-        """Step the simulation; the viewer does so at its own pace, and may have other targets."""
+        """Step the simulation. With a viewer, the viewer steps it in real time, and may replace the targets."""
         return self.simulation.step(targets) if self.viewer is None else self.viewer.step(targets)
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The picture of what the last observation shows, uint8 (height, width, 3); None but for "rgb_array".
+        """Draw the state of the last observation: uint8 (height, width, 3), RGB; None without render_mode "rgb_array".
 
         Raises:
             MissingExtraError: no renderer is installed.
         """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() draws nothing: give render_mode='rgb_array' or 'human'")
+            gymnasium.logger.warn(
+                "render() draws nothing without a render_mode: choose render_mode='rgb_array' or 'human'"
+            )
         if self.render_mode != "rgb_array":
             return None
         return self._pictures.of(view_of(self.simulation, 0))
 
     def _show(self) -> None:
-        """Show the arm in the viewer, which is made when the first episode begins."""
+        """Show the arm in the viewer; the first call opens the viewer."""
         if self.viewer is None:
             from gym_mara.viewer.viewer import Viewer
 
@@ -119,14 +121,14 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.viewer.show()
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"viewer": None}  # a copy gets its own when it is reset
+        return vars(self) | {"viewer": None}  # a copy opens its own viewer in reset()
 
     def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arm, the episode and the random generators; it pickles."""
+        """A snapshot of the arm, the episode and the random generators; it can be pickled."""
         return self.simulation.save() | {"np_random": copy.deepcopy(self.np_random)}
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot of an environment made alike."""
+        """Restore a snapshot of an environment with the same arguments."""
         self.simulation.restore(snapshot)
         self.np_random = copy.deepcopy(snapshot["np_random"])
         self._spawned_from = self.np_random if self.simulation.streams else None
@@ -141,12 +143,16 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
 
 
 def checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
-    """The render mode, if it is one of those known."""
+    """Return the render mode if it is a known one.
+
+    Raises:
+        GymMaraError: it is unknown.
+    """
     if render_mode is not None and render_mode not in known:
         raise unknown("render_mode", render_mode, known)
     return render_mode
 
 
 def _info_of_one(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """A batch of infos of one arm as plain numbers, arrays and objects."""
+    """Convert the batch of one arm's infos to plain numbers, arrays and objects."""
     return {name: v.item() if v.ndim == 1 else v[0] for name, v in values.items()}

@@ -1,4 +1,4 @@
-"""Per-episode statistics, as gym-gazebo2 reports them."""
+"""The statistics of an episode that gym-gazebo2 reports."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ Floats = NDArray[np.float64]
 
 
 class EpisodeStatistics:
-    """Largest, mean and smallest distance and reward, and the number of collisions, of N running episodes.
+    """The largest, mean and smallest distance and reward, and the number of collisions, of N running episodes.
 
-    The names are gym-gazebo2's; its distance is the root mean square over x, y and z, m.
+    The names are those of gym-gazebo2. The distance is the root mean square of the position error over x, y and z, m.
     """
 
     NAMES = (
@@ -28,10 +28,10 @@ class EpisodeStatistics:
     )
 
     def __init__(self, num_envs: int) -> None:
-        # A row a name; the rows of means hold sums, those of steps and collisions count.
+        # One row per name. The rows of means hold sums; the rows of steps and collisions hold counts.
         self._values = np.zeros((len(self.NAMES), num_envs))
         self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:8]
-        # One step's distance, reward, step and collision.
+        # The distance, the reward, the count 1 and the collision of one step.
         self._step = np.ones((4, num_envs))
         self.clear(slice(None))
 
@@ -41,20 +41,20 @@ class EpisodeStatistics:
         return self._values[6]
 
     def add(self, distance: Floats, reward: Floats, collided: NDArray[np.bool_]) -> None:
-        """Count one step of every episode; all arrays (N,), distance in m."""
+        """Add one step of every episode. All arrays are (N,); the distance is in m."""
         self._step[0], self._step[1], self._step[3] = distance, reward, collided
         np.maximum(self._max, self._step[:2], out=self._max)
         np.minimum(self._min, self._step[:2], out=self._min)
         self._sum += self._step
 
     def clear(self, chosen: NDArray[np.bool_] | slice) -> None:
-        """Begin the chosen episodes anew."""
+        """Start new statistics for the chosen episodes."""
         self._values[:, chosen] = 0.0
         self._max[:, chosen] = -np.inf
         self._min[:, chosen] = np.inf
 
     def summary(self) -> dict[str, NDArray[Any]]:
-        """The figures of every episode so far, each (N,)."""
+        """The statistics of every episode so far, each (N,)."""
         values = self._values.copy()
         values[4:6] /= np.maximum(values[6], 1.0)
         summary: dict[str, NDArray[Any]] = dict(zip(self.NAMES, values, strict=True))
@@ -63,7 +63,7 @@ class EpisodeStatistics:
         return summary
 
     def of(self, index: int) -> dict[str, float]:
-        """The figures of one episode so far, as plain numbers."""
+        """The statistics of one episode so far, as plain numbers."""
         *values, dist_sum, rew_sum, steps, collisions = self._values[:, index].tolist()
         count = max(steps, 1.0)
         values += [dist_sum / count, rew_sum / count, int(steps), int(collisions)]

@@ -1,4 +1,4 @@
-"""The sources of randomness of an arm: one stream for each purpose, so that none changes another."""
+"""The random generators of an arm: an independent one for each purpose, so that one use does not affect another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gymnasium.utils.seeding import np_random
 
 
 class Streams(NamedTuple):
-    """Independent random generators, spawned from the environment's own."""
+    """Independent random generators, spawned from the generator of the environment."""
 
     goals: np.random.Generator
     """Draws the goal of each episode."""
@@ -18,17 +18,17 @@ class Streams(NamedTuple):
     sensors: np.random.Generator
     """Draws the sensors' noise."""
     backends: np.random.Generator
-    """Seeds the parameters after a switch of the backend."""
+    """Seeds the physical parameters after a switch of the backend."""
 
     @classmethod
     def of(cls, generator: np.random.Generator) -> Streams:
-        """The streams of an arm with this generator.
+        """Spawn the streams of an arm from this generator.
 
-        Source: `numpy.random.Generator.spawn`, which spawns from the generator's SeedSequence.
+        `numpy.random.Generator.spawn` uses the generator's SeedSequence.
         """
         return cls(*generator.spawn(len(cls._fields)))
 
     @classmethod
     def seeded(cls, seed: int | None) -> Streams:
-        """The streams of an arm with this seed, those of an environment that is reset with it; None for any."""
+        """The streams of an environment after reset(seed=seed); None for a random seed."""
         return cls.of(np_random(seed)[0])

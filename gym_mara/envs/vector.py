@@ -1,4 +1,4 @@
-"""MaraVectorEnv: many arms in one batch."""
+"""MaraVectorEnv: a batch of arms."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from gym_mara.types import Floats, Mask
 
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
-    """N arms in one batch: the numbers of N MaraEnvs, at a fraction of the time.
+    """N arms in one batch: it gives the same results as N MaraEnvs in a fraction of the time.
 
-    `info` is MaraEnv's in Gymnasium's form for vectors, with `statistics` at the last step of an episode. Keys that hold
-    values of the same arms share one mask.
+    `info` has the keys of MaraEnv in Gymnasium's format for vector environments. `statistics` appear only at the last
+    step of an episode. Keys with values of the same arms share one mask array.
 
     Args:
         num_envs: N.
         task, robot, ee_frame, backend, **options: as in MaraEnv.
         render_mode: "rgb_array" for pictures of every arm, or None.
-        max_episode_steps: the length of an episode, after which it is truncated; None for no end.
-        autoreset_mode: Gymnasium's: "NextStep", "SameStep" or "Disabled".
+        max_episode_steps: the number of steps after which an episode is truncated; None for no limit.
+        autoreset_mode: Gymnasium's autoreset mode: "NextStep", "SameStep" or "Disabled".
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
@@ -54,7 +54,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
-        self.closed = True  # until it is whole: Gymnasium closes even what could not be made
+        self.closed = (
+            True  # until the end of __init__: Gymnasium calls close() even if __init__ fails
+        )
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
@@ -82,13 +84,19 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin episodes, of all arms or of those that `options["reset_mask"]`, bool (N,), chooses."""
+        """Begin episodes of all arms, or of the arms that `options["reset_mask"]`, bool (N,), selects.
+
+        Raises:
+            GymMaraError: the number of seeds is not N, or the mask is not valid.
+        """
         seeds: Sequence[int | None] = [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + index for index in range(self.num_envs)]
         elif seed is not None:
             if len(seed) != self.num_envs:
-                raise GymMaraError(f"{len(seed)} seeds for {self.num_envs} environments")
+                raise GymMaraError(
+                    f"{len(seed)} seeds for {self.num_envs} environments: give one seed per environment, or one int"
+                )
             seeds = seed
         super().reset(seed=seeds[0])
         mask = (options or {}).get("reset_mask")
@@ -96,7 +104,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             mask = np.asarray(mask)
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
                 raise GymMaraError(
-                    f"reset_mask must be bool, of shape {(self.num_envs,)}, and choose at least one"
+                    f"reset_mask must be bool, of shape {(self.num_envs,)}, and select at least one arm"
                 )
         chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
         self._ended[chosen] = False
@@ -106,7 +114,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return observation, _vector_info(report, chosen)
 
     def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
-        """Give each arm its own streams, those that a MaraEnv has with the arm's seed."""
+        """Set the streams of each arm to those of a MaraEnv with the arm's seed."""
         streams = dict(enumerate(self.simulation.streams))
         for index, seed in enumerate(seeds):
             if index not in streams or (chosen[index] and seed is not None):
@@ -117,13 +125,14 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the actions have the wrong shape or are not finite; no arm has moved then.
+            GymMaraError: the actions have the wrong shape or are not finite, or an ended episode was not reset. No arm
+                moves then.
         """
         resetting = self._ended
         some_reset = bool(np.count_nonzero(resetting))
         if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
             raise GymMaraError(
-                "episodes have ended: reset them, reset(options={'reset_mask': …}), before the next step"
+                "episodes have ended: call reset(options={'reset_mask': …}) for them before the next step"
             )
         outcome = self.simulation.step(actions)
         observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
@@ -131,7 +140,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         if outcome.truncated is not None:
             truncated |= outcome.truncated
         stepped = ~resetting
-        if some_reset:  # NEXT_STEP: these begin an episode instead of stepping
+        if some_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
             first, report = self.simulation.reset(resetting)
             observation = np.where(resetting[:, None], first, observation)
             reward = np.where(resetting, 0.0, reward)
@@ -151,15 +160,15 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def _begin_next(
         self, outcome: Outcome, final: dict[str, Any], ended: Mask
     ) -> tuple[Floats, dict[str, Any]]:
-        """SAME_STEP: begin the next episodes of the arms (N,) whose episodes have ended.
+        """Begin the next episodes of the arms whose episodes have ended, for SAME_STEP.
 
         Args:
-            outcome: of the step.
-            final: its info in Gymnasium's form, with the statistics.
-            ended: which arms.
+            outcome: the outcome of the step.
+            final: the info of the step in Gymnasium's format, with the statistics.
+            ended: the arms (N,).
 
         Returns:
-            The observations (N, O), of those arms the first of their new episodes, and the info.
+            The observations (N, O), which for these arms are the first of their new episodes, and the info.
         """
         last = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended):
@@ -173,7 +182,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return np.where(ended[:, None], first, outcome.observation), info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture of each arm, of what its last observation shows; None without a render_mode.
+        """Draw each arm in the state of its last observation: uint8 (height, width, 3), RGB; None without render_mode.
 
         Raises:
             MissingExtraError: no renderer is installed.
@@ -184,20 +193,20 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         return tuple(self._pictures.of(view_of(self.simulation, arm)) for arm in arms)
 
     def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arms, the episodes and the random generators; it pickles."""
+        """A snapshot of the arms, the episodes and the random generators; it can be pickled."""
         return self.simulation.save() | {
             "ended": self._ended.copy(),
             "np_random": copy.deepcopy(self.np_random),
         }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot of an environment made alike."""
+        """Restore a snapshot of an environment with the same arguments."""
         self.simulation.restore(snapshot)
         self._ended = snapshot["ended"].copy()
         self.np_random = copy.deepcopy(snapshot["np_random"])
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the backend and the renderer; called by close()."""
+        """Free the backend and the renderer; close() calls this method."""
         self._pictures.close()
         self.simulation.close()
 
@@ -210,7 +219,7 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
-    """Gymnasium's form of a batch of infos: a mask `_key` beside each key tells which arms have a value."""
+    """Convert infos to Gymnasium's format for vector environments: the mask `_key` marks the arms that have a `key`."""
     info: dict[str, Any] = {}
     everyone = np.count_nonzero(mask) == len(mask)
     for key, value in values.items():
@@ -227,12 +236,12 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
 
 
 def _add_rows(info: dict[str, Any], values: dict[str, NDArray[Any]], arms: Mask) -> None:
-    """Enter the values of some arms into an info that holds those of others."""
+    """Add the values of some arms to an info that has the values of other arms."""
     for key, value in values.items():
         info[key] = np.where(_rows(arms, value), value, info[key])
         info[f"_{key}"] = info[f"_{key}"] | arms
 
 
 def _rows(mask: Mask, value: NDArray[Any]) -> Mask:
-    """A mask (N,) that broadcasts against values (N, …)."""
+    """Reshape a mask (N,) so that it broadcasts with values (N, …)."""
     return mask.reshape(-1, *(1,) * (value.ndim - 1))

@@ -1,4 +1,4 @@
-"""From a simulation to a View, which renderers and the viewer show."""
+"""Makes the View of an arm that renderers and the viewer draw."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from gym_mara.rendering.view import View
 
 
 def view_of(simulation: Simulation, arm: int) -> View:
-    """An arm as its last observation shows it: where it collided and was put back, it still collides there."""
+    """The View of an arm in the state of its last observation: after a collision, it shows the colliding state."""
     state, goal = simulation.observed(arm), simulation.goal
     touching: frozenset[str] = frozenset()
     if state.collided[arm]:

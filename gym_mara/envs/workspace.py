@@ -1,4 +1,4 @@
-"""Which poses an arm can reach, for tasks, which know no engine."""
+"""The poses that an arm can reach, for tasks, which do not depend on a collision engine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gym_mara.types import Floats
 
 
 class RobotWorkspace:
-    """The poses of a robot's end effector; what looks for them is made when it is first needed.
+    """The poses that a robot's end effector can reach. The search for free poses is prepared at its first use.
 
     Args:
         robot: the arm.
@@ -22,19 +22,19 @@ class RobotWorkspace:
         self._free_poses: FreePoses | None = None
 
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """The pose of a random configuration without a collision.
+        """The pose of a random collision-free configuration.
 
         Raises:
-            GymMaraError: nearly every configuration of the robot collides.
+            GymMaraError: almost all configurations of the robot collide.
         """
         if self._free_poses is None:
             self._free_poses = FreePoses(self._robot)
         return self._free_poses.draw(generator)
 
     def default_pose(self) -> tuple[Floats, Floats]:
-        """The pose of a configuration without a collision, always the same for a robot."""
+        """The pose of a collision-free configuration, always the same for a robot."""
         return reachable_pose(self._robot)
 
     def shortfall(self, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
-        """How near the arm can come to a pose: the distance left, m, and the angle left, rad."""
+        """How close the arm can come to a pose: the remaining distance, m, and the remaining angle, rad."""
         return miss(self._robot, position, quaternion)

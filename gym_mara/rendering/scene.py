@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gym_mara.extras import needs
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
+from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.types import Floats
 
 with needs("rendering", "render", "trimesh"):
@@ -74,7 +75,7 @@ class Scene:
         self._geometry_index: list[int] = []
         for index, shape in enumerate(self._geometry.geometryObjects):
             link = str(self._model.frames[shape.parentFrame].name)
-            for mesh, colour in _meshes_of(shape):
+            for mesh, colour in _meshes_of(self._model, shape):
                 name = f"{shape.name}/{len(parts)}"
                 parts.append(_part(name, link, mesh, colour, fixed=shape.parentJoint == 0))
                 self._geometry_index.append(index)
@@ -103,7 +104,7 @@ class Scene:
         ]
 
     def bounds(self, view: View, *, moving: bool = True) -> tuple[Floats, Floats]:
-        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts; the target is included."""
+        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts, and of the target."""
         corners = [view.target_position[None].astype(np.float32)]
         for part, placement in zip(self.parts, self.placements(view), strict=True):
             if not part.marker and not (moving and part.fixed):
@@ -112,42 +113,39 @@ class Scene:
         return points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
 
 
-def _meshes_of(shape: pin.GeometryObject) -> list[tuple[trimesh.Trimesh, Colour]]:
+def _meshes_of(
+    model: pin.Model, visual: pin.GeometryObject
+) -> list[tuple[trimesh.Trimesh, Colour]]:
     """The meshes of a URDF visual, in its frame, each with its colour."""
-    red, green, blue, _ = np.asarray(shape.meshColor, float).tolist()
+    red, green, blue, _ = np.asarray(visual.meshColor, float).tolist()
     own: Colour = (red, green, blue)
-    primitive = _primitive(shape.geometry)
-    if primitive is not None:
-        return [(_with_creases(primitive), own)]
+    shape = shape_of(model, visual)
+    if not isinstance(shape, Mesh):
+        return [(_with_creases(_primitive(shape)), own)]
     found = []
-    for mesh in trimesh.load_scene(shape.meshPath).dump():
+    for mesh in trimesh.load_scene(shape.path).dump():
         if isinstance(mesh, trimesh.Trimesh):
-            mesh.apply_scale(np.asarray(shape.meshScale))
-            colour = own if shape.overrideMaterial else _colour_of(mesh)
+            mesh.apply_scale(shape.scale)
+            colour = own if visual.overrideMaterial else _colour_of(mesh)
             # STL stores no vertex normals, so creases are found by angle; the other formats store them.
-            is_stl = shape.meshPath.lower().endswith(".stl")
+            is_stl = shape.path.lower().endswith(".stl")
             found.append((_with_creases(mesh) if is_stl else mesh, colour))
     return found
 
 
-def _primitive(geometry: Any) -> trimesh.Trimesh | None:
-    """The mesh of a URDF primitive; None if the shape is a mesh file."""
-    kind = type(geometry).__name__
-    if kind == "Box":
-        return trimesh.creation.box(2.0 * np.asarray(geometry.halfSide))
-    if kind == "Sphere":
-        return trimesh.creation.icosphere(subdivisions=3, radius=geometry.radius)
-    if kind == "Cylinder":
-        height = 2.0 * geometry.halfLength
-        return trimesh.creation.cylinder(geometry.radius, height, sections=_CIRCLE_SIDES)
-    if kind == "Capsule":
-        height = 2.0 * geometry.halfLength
-        mesh = trimesh.creation.capsule(
-            height, geometry.radius, count=(_CIRCLE_SIDES, _CIRCLE_SIDES)
-        )
-        mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
-        return mesh
-    return None
+def _primitive(shape: Box | Sphere | Cylinder | Capsule) -> trimesh.Trimesh:
+    """The mesh of a URDF primitive."""
+    match shape:
+        case Box(size):
+            return trimesh.creation.box(size)
+        case Sphere(radius):
+            return trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        case Cylinder(radius, length):
+            return trimesh.creation.cylinder(radius, length, sections=_CIRCLE_SIDES)
+        case Capsule(radius, length):
+            mesh = trimesh.creation.capsule(length, radius, count=(_CIRCLE_SIDES, _CIRCLE_SIDES))
+            mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
+            return mesh
 
 
 def _with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -1,4 +1,4 @@
-"""The robot: what the arm is, where its links are at a configuration, and whether they collide there."""
+"""The robot: its model, forward and inverse kinematics, shapes and collision pairs."""
 
 from gym_mara.robot.model import RobotLike, RobotModel
 

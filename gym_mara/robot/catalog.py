@@ -1,4 +1,4 @@
-"""The robots known by name, and where their files lie."""
+"""The robots known by name, and their files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gym_mara.errors import MissingExtraError, unknown
 
 
 class RobotFiles(NamedTuple):
-    """A robot's URDF, its SRDF if it has one, and its end-effector frame if the SRDF does not name it."""
+    """A robot's URDF, its SRDF if it has one, and its end-effector frame unless the SRDF names it."""
 
     urdf: Path
     srdf: Path | None = None
@@ -25,7 +25,7 @@ def _robots_dir() -> Path:
 
 
 def own_robots() -> dict[str, RobotFiles]:
-    """The robots that gym_mara ships: a folder each, with NAME.urdf and NAME.srdf in it."""
+    """The robots that gym_mara ships: one folder NAME each, with NAME.urdf and NAME.srdf."""
     return {
         urdf.stem: RobotFiles(urdf, urdf.with_suffix(".srdf"))
         for urdf in sorted(_robots_dir().glob("*/*.urdf"))
@@ -34,7 +34,7 @@ def own_robots() -> dict[str, RobotFiles]:
 
 
 def example_robots_dir() -> Path | None:
-    """The folder of example-robot-data's robots, or None where it is not installed."""
+    """The folder of example-robot-data's robots, or None if it is not installed."""
     for parent in Path(pinocchio.__file__).resolve().parents:
         folder = parent / "share" / "example-robot-data" / "robots"
         if folder.is_dir():
@@ -43,7 +43,7 @@ def example_robots_dir() -> Path | None:
 
 
 def _example_arms() -> dict[str, dict[str, str | None]]:
-    """The fixed-base arms of example-robot-data, their files named below its folder of robots."""
+    """The fixed-base arms of example-robot-data by name, their files relative to its folder of robots."""
     arms: dict[str, dict[str, str | None]] = json.loads(
         (_robots_dir() / "example_arms.json").read_text()
     )
@@ -51,7 +51,7 @@ def _example_arms() -> dict[str, dict[str, str | None]]:
 
 
 def robot_names() -> list[str]:
-    """Every name that `find` knows; the robots that gym_mara ships come first."""
+    """Every name that `find` accepts; the robots that gym_mara ships come first."""
     return [*own_robots(), *_example_arms()]
 
 
@@ -60,7 +60,7 @@ def find(name: str) -> RobotFiles:
 
     Raises:
         GymMaraError: no robot has this name.
-        MissingExtraError: it is one of example-robot-data's, which is not installed.
+        MissingExtraError: the robot comes with example-robot-data, which is not installed.
     """
     own = own_robots()
     if name in own:

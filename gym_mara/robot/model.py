@@ -1,4 +1,4 @@
-"""RobotModel: what an arm is, read once from its URDF and SRDF."""
+"""RobotModel: everything the package knows of an arm, read once from its URDF and SRDF."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from gym_mara.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A fixed-base arm: the chain of joints from the world to its end-effector frame, and all that hangs on it.
+    """A fixed-base arm: the chain of joints from the world to the end-effector frame, with all links attached to it.
 
     Joints off the chain (a gripper's fingers) are locked. Arrays are read-only, (J,), in the order of the chain.
     """
 
     name: str
     urdf: Path
-    """The file that it was read from; MARA's for an arm composed of MARA's modules."""
+    """The file that the arm was read from; MARA's for an arm composed of modules."""
     srdf: Path | None
     modules: tuple[str, ...]
-    """What it was composed of, from the base to the tool; nothing otherwise."""
+    """The modules that the arm was composed of, from the base to the tool; empty otherwise."""
     xml: str
-    """Its description, all joints off the chain fixed."""
+    """The URDF as text, with all joints off the chain fixed."""
     ee_frame: str
     joint_names: tuple[str, ...]
     lower: Floats
@@ -48,7 +48,7 @@ class RobotModel:
     effort_limit: Floats
     """Nm (N)."""
     home: Floats
-    """The start pose: the SRDF's first that names every joint, else zeros, within the limits."""
+    """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
     collision_pairs: frozenset[frozenset[str]]
     """The pairs of links that may collide."""
     model: pin.Model
@@ -58,10 +58,16 @@ class RobotModel:
 
     @classmethod
     def load(cls, robot: RobotLike | Path, ee_frame: str | None = None) -> RobotModel:
-        """The robot of a name ("mara", "ur5", …), of a path to a URDF, of a list of modules, or itself.
+        """Load a robot by its name ("mara", "ur5", …), the path of its URDF, or a list of modules.
+
+        A RobotModel is returned as it is.
+
+        Args:
+            robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
+            ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
 
         Raises:
-            GymMaraError: the name is unknown, or the URDF is not one of a fixed-base arm.
+            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
             MissingExtraError: the robot's files come with a package that is not installed.
         """
         if isinstance(robot, RobotModel):
@@ -88,19 +94,22 @@ class RobotModel:
         *,
         name: str | None = None,
     ) -> RobotModel:
-        """Load an arm from files of your own.
+        """Load an arm from your own files.
 
         Meshes are looked for beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
-        Without an SRDF that disables pairs, links joined by one joint and links that touch at home do not collide.
+        Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables
+        pairs of links.
 
         Args:
             urdf: path of the URDF file.
             ee_frame: the end-effector link; by default the one that the SRDF names.
             srdf: path of the SRDF file: disabled collisions, home pose, end effector.
-            name: what the robot is called; by default as in the URDF.
+            name: the robot's name; by default the one in the URDF.
 
         Raises:
-            GymMaraError: a file is missing or broken, the frame does not exist or no fixed-base chain leads to it.
+            GymMaraError: a file is missing or broken, the frame does not exist, or no fixed-base chain leads to it.
+
+        Warns if the SRDF names links or joints that the URDF lacks.
         """
         return cls._from_files(Path(urdf), ee_frame, Path(srdf) if srdf else None, name, warn=True)
 
@@ -132,10 +141,10 @@ class RobotModel:
 
         Args:
             modules: from "base" to "tool"; between them "motor_large", "motor_medium", "motor_small", "link_straight" and
-                "link_bent", as often and in such an order as their faces fit. A motor turns what is joined to either face.
+                "link_bent", in any number and order in which their faces fit. A motor makes a joint at each of its faces.
 
         Raises:
-            GymMaraError: a module is unknown or does not fit, or the number of joints is another.
+            GymMaraError: a module is unknown or does not fit, or the arm has too few or too many joints.
         """
         urdf = catalog.find("mara").urdf
         root = compose(urdf, modules)
@@ -183,16 +192,17 @@ class RobotModel:
 
     @property
     def ee_frame_id(self) -> int:
-        """Pinocchio's number of the end-effector frame; a joint may bear the same name."""
+        """Pinocchio's index of the end-effector frame."""
+        # The type is given because a joint may have the same name.
         return int(self.model.getFrameId(self.ee_frame, pin.FrameType.BODY))
 
     @cached_property
     def visual(self) -> pin.GeometryModel:
-        """Pinocchio's visual geometry; read when first asked for."""
+        """Pinocchio's visual geometry, read on first use."""
         return visual_geometry(self.urdf, self.xml, self.model)
 
     def kinematics(self) -> Kinematics:
-        """Forward kinematics of many configurations at once, with a work space of its own."""
+        """The forward kinematics, a new instance for each caller."""
         return Kinematics(self.model, self.ee_frame_id)
 
     @cached_property
@@ -212,13 +222,13 @@ class RobotModel:
 
     @cached_property
     def _lengths(self) -> Floats:
-        """How far at most each joint's origin can be from the joint's before (J,), m; the first from the world's."""
+        """A bound (J,) on how far each joint's origin is from that of the joint before, m; the first from the world's."""
         slides = self.kinematics().prismatic
         span = np.where(slides, np.maximum(abs(self.lower), abs(self.upper)), 0.0)
         return span + [np.linalg.norm(p.translation) for p in self.model.jointPlacements[1:]]
 
     def _points(self) -> list[tuple[int, float]]:
-        """How far the points of the arm are at most from the joint that carries them: joint number, m."""
+        """Bounds on how far the arm's points are from the joint that carries them: joint number, m."""
         frame = self.model.frames[self.ee_frame_id]
         points = [(int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)))]
         for geometry_object in self.geometry.geometryObjects:
@@ -230,14 +240,18 @@ class RobotModel:
         return points
 
     def link_of(self, geometry_index: int) -> str:
-        """The name of the link that a collision geometry belongs to."""
+        """The name of the link that a collision shape belongs to, given the shape's index."""
         return link_of(self.model, self.geometry.geometryObjects[geometry_index])
 
     def checked_q(self, q: Sequence[float] | Floats, what: str) -> Floats:
-        """A configuration (J,) of this robot within its limits, as a fresh array.
+        """A configuration (J,) checked to be within this robot's limits, as a new array.
+
+        Args:
+            q: the configuration, rad.
+            what: what it is, for the error.
 
         Raises:
-            GymMaraError: it has another length, is not finite or is beyond a joint's limits.
+            GymMaraError: it has the wrong length, is not finite or is beyond a joint's limits.
         """
         array = np.array(q, dtype=np.float64)
         if array.shape != (self.num_joints,):
@@ -254,7 +268,7 @@ class RobotModel:
         return array
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Pinocchio's geometry does not pickle; the modules, or the files, say it all.
+        # Pinocchio's geometry does not pickle; a copy is loaded from the modules or the files.
         if self.modules:
             return RobotModel.from_modules, (self.modules,)
         return RobotModel._from_files, (self.urdf, self.ee_frame, self.srdf, self.name)
@@ -267,7 +281,7 @@ class RobotModel:
 
 
 RobotLike = str | Sequence[str] | RobotModel
-"""A robot's name, the path of its URDF, its modules, or itself."""
+"""A robot's name, the path of its URDF, a list of modules, or a loaded robot."""
 
 
 def _read_only(values: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """Arms composed of MARA's modules: a base, motors of three sizes, two links, a tool.
 
-A module is a link of MARA as its URDF has it, with the faces by which it is joined to its neighbours. A motor turns what is
-joined to either of its faces; between two modules without a motor nothing turns.
+A module is a link of MARA's URDF with the two faces that join it to its neighbours. There is a joint at a face if the module
+on at least one side of it is a motor; otherwise the two modules are fixed to each other.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.robot.srdf import read_xml
+from gym_mara.types import Floats
 
 FEWEST_JOINTS, MOST_JOINTS = 3, 7
 EE_FRAME = "ee_link"
 
 
 class Face(NamedTuple):
-    """Where a module is joined to another: MARA's joint there, and the way that the face looks."""
+    """Where a module is joined to another: MARA's joint there, and the direction of the face's normal."""
 
     joint: str
     normal: str
-    """An axis of the module's frame and its sign, such as "+z"."""
+    """A signed axis of the module's frame, such as "+z"."""
 
 
 class Module(NamedTuple):
-    """A link of MARA, its face towards the base and its face towards the tool."""
+    """A link of MARA with its inner face, towards the base, and its outer face, towards the tool."""
 
     link: str
     inner: Face | None
@@ -41,7 +41,7 @@ class Module(NamedTuple):
     upside_down: bool = False
 
     def reversed(self) -> Module:
-        """The module mounted the other way round, so that an arm still goes up at home."""
+        """The module mounted the other way round; turned upside down, so that the arm still points up at home."""
         return self._replace(inner=self.outer, outer=self.inner, upside_down=True)
 
 
@@ -62,8 +62,8 @@ def compose(mara: Path, names: Sequence[str]) -> ElementTree.Element:
     """The URDF of an arm made of modules, on MARA's table.
 
     Args:
-        mara: MARA's URDF.
-        names: the modules from the base to the tool, of `MODULES`.
+        mara: path of MARA's URDF.
+        names: the modules from the base to the tool, keys of `MODULES`.
 
     Raises:
         GymMaraError: a name is unknown, two faces do not fit, or the arm has too few or too many joints.
@@ -82,7 +82,7 @@ def compose(mara: Path, names: Sequence[str]) -> ElementTree.Element:
         turns = before.motor or module.motor
         turning += turns
         name = f"motor{turning}_link" if turns else f"module{number}_link"
-        # A link's frame is where it is joined to the one before; a reversed module's own frame is elsewhere.
+        # Each link's frame lies at its inner face. The own frame of a reversed module does not, so it is moved.
         origin = _place(joints, before, before.outer) - inner
         inner = _place(joints, module, module.inner)
         link = _moved(links[module.link], -inner)
@@ -99,8 +99,8 @@ def compose(mara: Path, names: Sequence[str]) -> ElementTree.Element:
         before, name_before = module, name
     if not FEWEST_JOINTS <= turning <= MOST_JOINTS:
         raise GymMaraError(
-            f"an arm has {FEWEST_JOINTS} to {MOST_JOINTS} joints, and {', '.join(names)} makes {turning}: "
-            "a motor turns what is joined to either of its faces"
+            f"an arm must have {FEWEST_JOINTS} to {MOST_JOINTS} joints, and {', '.join(names)} makes {turning}; "
+            "a motor makes a joint at each of its two faces"
         )
     tool = next(j for j in source.iter("joint") if _end(j, "child") == EE_FRAME)
     tool = copy.deepcopy(tool)
@@ -110,14 +110,14 @@ def compose(mara: Path, names: Sequence[str]) -> ElementTree.Element:
 
 
 def _oriented(names: Sequence[str]) -> list[Module]:
-    """The modules, each the way round in which it fits the one before."""
+    """The modules, each reversed if only then it fits the one before."""
     for name in names:
         if name not in MODULES:
             raise unknown("module", name, MODULES)
     ends = [name for name in names if name in ("base", "tool")]
     if ends != ["base", "tool"] or names[0] != "base" or names[-1] != "tool":
         raise GymMaraError(
-            f"an arm begins with its one 'base' and ends with its one 'tool', not {', '.join(names)}"
+            f"an arm must begin with its only 'base' and end with its only 'tool'; this is: {', '.join(names)}"
         )
     modules = [MODULES["base"]]
     for number, name in enumerate(names[1:], start=1):
@@ -128,7 +128,7 @@ def _oriented(names: Sequence[str]) -> list[Module]:
         if not fitting:
             raise GymMaraError(
                 f"{name!r} does not fit onto {names[number - 1]!r}: {_fits(outer)}; "
-                "a motor has a face at its end (z) and one at its side (x)"
+                "a motor has one face at its end (z) and one at its side (x)"
             )
         modules.append(fitting[0])
     return modules
@@ -141,11 +141,11 @@ def _fits(outer: Face) -> str:
         for name, module in MODULES.items()
         if name != "base" and axis in {f.normal[1] for f in (module.inner, module.outer) if f}
     ]
-    return f"onto its face along {axis} fit {', '.join(fitting)}"
+    return f"what fits onto its face along {axis}: {', '.join(fitting)}"
 
 
 def _scene(source: ElementTree.Element) -> ElementTree.Element:
-    """MARA's description without its arm: colours, the table, the base."""
+    """MARA's URDF without its arm: colours, the table, the base."""
     moving = [module.link for module in MODULES.values() if module.inner] + [EE_FRAME]
     scene = ElementTree.Element("robot", name="modular")
     for element in source:
@@ -160,16 +160,14 @@ def _end(joint: ElementTree.Element, which: str) -> str | None:
     return None if end is None else end.get("link")
 
 
-def _place(
-    joints: dict[str | None, ElementTree.Element], module: Module, face: Face
-) -> NDArray[np.float64]:
-    """Where a face is in the module's own frame (3,), m: in MARA the frame lies at the face towards the base."""
+def _place(joints: dict[str | None, ElementTree.Element], module: Module, face: Face) -> Floats:
+    """A face's position in the module's own frame (3,), m; in MARA that frame lies at the face towards the base."""
     joint = joints[face.joint]
     return _vector(joint.find("origin")) if _end(joint, "parent") == module.link else np.zeros(3)
 
 
 def _turn(before: Module, module: Module) -> str:
-    """How a module stands on the one before, as roll, pitch, yaw: face to face, and with its outer end up."""
+    """A module's rotation on the one before, as roll, pitch, yaw: face to face, and with its outer end up."""
     outer, inner = before.outer, module.inner
     assert outer is not None
     assert inner is not None
@@ -178,8 +176,8 @@ def _turn(before: Module, module: Module) -> str:
     return f"{roll!r} 0.0 {yaw!r}"
 
 
-def _moved(link: ElementTree.Element, by: NDArray[np.float64]) -> ElementTree.Element:
-    """A copy of a link with all that it consists of moved (3,), m."""
+def _moved(link: ElementTree.Element, by: Floats) -> ElementTree.Element:
+    """A copy of a link with its inertia and shapes moved by a vector (3,), m."""
     link = copy.deepcopy(link)
     for part in link:
         origin = part.find("origin")
@@ -188,11 +186,11 @@ def _moved(link: ElementTree.Element, by: NDArray[np.float64]) -> ElementTree.El
     return link
 
 
-def _vector(origin: ElementTree.Element | None) -> NDArray[np.float64]:
+def _vector(origin: ElementTree.Element | None) -> Floats:
     return np.array(
         [float(x) for x in (origin.get("xyz", "0 0 0") if origin is not None else "0 0 0").split()]
     )
 
 
-def _text(vector: NDArray[np.float64]) -> str:
+def _text(vector: Floats) -> str:
     return " ".join(repr(float(x)) for x in vector)

@@ -1,4 +1,4 @@
-"""The contract of a task: it observes and rewards the state of N arms with their goals, and does not depend on a backend."""
+"""The contract of a task: it observes and rewards the states of N arms with their goals, whatever the backend."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Goal:
 
     @cached_property
     def _inverse(self) -> Floats:
-        # Contiguous: the last bits of a dot product depend on the memory layout, and copying an array can change its layout.
+        # Contiguous: the last bits of a dot product depend on the memory layout, which a copy of it could change.
         return np.ascontiguousarray(rotations.right_matrix(rotations.conjugate(self.quaternion)))
 
     def orientation_error(self, quaternion: Floats) -> Floats:

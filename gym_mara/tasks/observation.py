@@ -31,7 +31,7 @@ class Part:
     high: Floats
     """The upper bounds (K,)."""
     values: Callable[[SimState, Goal], Floats]
-    """Computes the values (N, K) for N arms. It must be a module-level function, so that environments can be pickled."""
+    """Computes the values (N, K) for N arms; a module-level function, so that environments can be pickled."""
 
 
 class Observation:

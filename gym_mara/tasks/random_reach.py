@@ -32,7 +32,7 @@ class RandomReachTask(ReachTask):
         super().__post_init__()
         if self.target_position is not None or self.target_quaternion is not None:
             raise GymMaraError(
-                "this task draws its targets: leave out target_position and target_quaternion, or choose the task MARA-v0"
+                "this task draws its targets: leave out target_position and target_quaternion, or choose MARA-v0"
             )
 
     def draw_goal(

@@ -20,7 +20,7 @@ from gym_mara.types import Floats, Mask
 if TYPE_CHECKING:
     from gym_mara.robot import RobotModel
 
-# The default target of a robot: position (m), quaternion [w, x, y, z]. MARA's target is the one of gym-gazebo2, where the
+# The default target of a robot: position (m), quaternion [w, x, y, z]. MARA's target is the one of gym-gazebo2: the
 # tool points straight down.
 _TARGETS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "mara": ((-0.40028, 0.095615, 0.72466), (0.0, 0.7071068, 0.7071068, 0.0)),
@@ -116,7 +116,7 @@ class ReachTask(Task):
     def judge(
         self, position: Floats, quaternion: Floats, collided: Mask, goal: Goal
     ) -> tuple[Floats, dict[str, Floats]]:
-        """The reward and its terms, as from `reward`, for end effectors at positions (N, 3), m, and quaternions (N, 4)."""
+        """The reward and its terms, as in `reward`, of end effectors at positions (N, 3), m, and quaternions (N, 4)."""
         error = position - goal.position
         position_error = np.sqrt(np.vecdot(error, error))
         distance = position_error * _RMS

@@ -1,4 +1,4 @@
-"""Steps a simulation in real time and shows it in the browser; the user can pause, jog the joints and drag the target."""
+"""Steps a simulation in real time and shows it in the browser; its user can pause, jog joints and drag the target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dynamic backend: Pinocchio as referee of its motion, Coal of its contacts, and what its motors can do."""
+"""The dynamic backend: its motion against Pinocchio, its contacts against Coal, and the limits of its motors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from gym_mara.testing import COLLIDING_Q, assert_same_state, pickled, uniform_q
 from gym_mara.types import Floats
 from tests.helpers import robot_model
 
-# In reach without touching anything on the way from home.
+# The path from home is free of collisions.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
 
 
 def _run(backend: DartBackend, target: Floats, steps: int) -> tuple[Floats, Floats]:
-    """Positions and torques (steps, J) of one arm on its way to a target."""
+    """Positions and torques (steps, J) of one arm that moves to a target."""
     positions, torques = [], []
     for _ in range(steps):
         state = backend.step(target[None])
@@ -47,7 +47,7 @@ def test_its_bodies_are_where_pinocchio_has_them(mara: RobotModel) -> None:
 
 
 def _fall(robot: RobotModel, q: Floats, step: float, seconds: float = 1.0) -> tuple[Floats, Floats]:
-    """Where a limp arm is after a while: by DART, and by Pinocchio's ABA integrated alike."""
+    """Where an arm without motors is after a while: by DART, and by Pinocchio's ABA with the same integrator."""
     arm = DartArm(robot, step, None, servo=False)
     arm.reset(q)
     model, data = robot.model, robot.model.createData()
@@ -74,7 +74,7 @@ def test_its_fall_converges_in_proportion_to_the_step(mara: RobotModel) -> None:
 
 
 def _energies(arm: DartArm, seconds: float) -> tuple[Floats, Floats]:
-    """Kinetic and total energy of an arm that moves by itself, J."""
+    """Kinetic and total energy of an arm without motors, J."""
     kinetic, potential = [], []
     for _ in range(round(seconds / arm.physics_step)):
         arm.world.step()
@@ -85,7 +85,7 @@ def _energies(arm: DartArm, seconds: float) -> tuple[Floats, Floats]:
 
 def test_a_swinging_arm_keeps_its_energy(mara: RobotModel) -> None:
     arm = DartArm(mara, 1e-3, None, servo=False)
-    arm.reset(np.array([0.3, 2.6, 0.3, 0.2, 0.3, 0.0]))  # hanging, nearly
+    arm.reset(np.array([0.3, 2.6, 0.3, 0.2, 0.3, 0.0]))  # nearly hanging
     kinetic, total = _energies(arm, 10.0)
     assert np.abs(total - total[0]).max() < 0.05 * kinetic.max()
 
@@ -136,7 +136,7 @@ def test_a_motor_too_weak_to_hold_the_arm_lets_it_sink(mara: RobotModel) -> None
     assert state.q[0, 1] > 1.6
 
 
-def test_joints_are_as_fast_as_asked(mara: RobotModel) -> None:
+def test_joints_move_at_max_joint_velocity(mara: RobotModel) -> None:
     backend = DartBackend(mara, 1, max_joint_velocity=0.5)
     speeds = np.abs([backend.step(FREE_TARGET[None]).qd[0] for _ in range(40)])
     np.testing.assert_allclose(speeds.max(axis=0)[1:3], 0.5, atol=1e-6)
@@ -150,7 +150,7 @@ def test_in_free_space_it_ends_where_the_kinematic_backend_does(mara: RobotModel
     for _ in range(150):
         states = [b.step(FREE_TARGET[None]) for b in (dynamic, kinematic)]
         apart.append(np.abs(states[0].q - states[1].q).max())
-    # The servo brakes over limit / gain = 0.157 rad, where the kinematic joint stops at once.
+    # The servo slows down over limit / gain = 0.157 rad; the kinematic joint does not.
     assert 0.01 < max(apart) < 0.157
     assert apart[-1] < 1e-5
     np.testing.assert_allclose(states[0].ee_position, states[1].ee_position, atol=1e-5)
@@ -173,7 +173,7 @@ def test_contacts_are_those_that_coal_finds(mara: RobotModel, detector: str) -> 
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_another_robot_touches_what_coal_says(name: str) -> None:
+def test_another_robot_has_contacts_where_coal_finds_them(name: str) -> None:
     robot = robot_model(name)
     arm, coal = DartArm(robot), make_checker("coal", robot)
     poses = uniform_q(robot, 60, seed=4)
@@ -185,7 +185,7 @@ def test_another_robot_touches_what_coal_says(name: str) -> None:
 
 
 def test_another_robot_falls_as_pinocchio_says() -> None:
-    robot = robot_model("ur5")  # as MARA without damping, which DART integrates implicitly
+    robot = robot_model("ur5")  # without damping, as MARA: DART integrates damping implicitly
     mine, theirs = _fall(robot, uniform_q(robot, 1, seed=4)[0], 1e-3, 0.5)
     np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-7)
 
@@ -201,8 +201,8 @@ def test_contacts_name_the_links_and_their_depth(mara: RobotModel) -> None:
         assert 0.0 <= contact.depth < 0.5
 
 
-def test_looking_only_where_contacts_can_come_about_misses_none(mara: RobotModel) -> None:
-    """Against an arm that looks for contacts at every physics step."""
+def test_no_contact_is_missed_where_collision_detection_is_skipped(mara: RobotModel) -> None:
+    """Against an arm that detects contacts at every physics step."""
     rng = np.random.default_rng(5)
     careful, quick = DartArm(mara), DartArm(mara)
     careful.may_touch = lambda: True  # type: ignore[method-assign]
@@ -218,7 +218,7 @@ def test_looking_only_where_contacts_can_come_about_misses_none(mara: RobotModel
     assert 20 < touched < 160
 
 
-def test_bounds_on_the_approach_of_links_hold(mara: RobotModel) -> None:
+def test_links_approach_no_more_than_the_bounds_say(mara: RobotModel) -> None:
     rng = np.random.default_rng(2)
     data, geometry_data = mara.model.createData(), mara.geometry.createData()
 

@@ -1,4 +1,4 @@
-"""The kinematic backend: teleports, and travel at a limited velocity with the whole path checked."""
+"""The kinematic backend: joints that teleport, and joints that travel along a path checked for collisions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from gym_mara.backends.pinocchio import PinocchioBackend
 from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, assert_same_state, uniform_q
-from tests.helpers import PATH_ENDS, Floats, robot_model
+from gym_mara.types import Floats, Mask
+from tests.helpers import PATH_ENDS, robot_model
 
 VELOCITY, PERIOD = 0.5, 0.02
 TRAVEL = VELOCITY * PERIOD
@@ -25,12 +25,12 @@ def _backend(num_envs: int = 1, **settings: Any) -> PinocchioBackend:
     return PinocchioBackend(robot_model("mara"), num_envs, **settings)
 
 
-def _on_the_way(start: Floats, target: Floats, travel: float) -> Floats:
-    """Where joints of equal speed are when each has moved at most this far."""
+def _travelled(start: Floats, target: Floats, travel: float) -> Floats:
+    """Where joints of equal velocity are when each has moved at most this far."""
     return start + np.clip(target - start, -travel, travel)
 
 
-def test_by_default_the_joints_are_at_their_targets_at_once_and_at_rest() -> None:
+def test_by_default_the_joints_reach_their_targets_in_one_step_and_rest() -> None:
     backend = _backend(3)
     backend.reset(np.zeros((3, 6)))
     target = uniform_q(backend.robot, 3, 0)
@@ -40,13 +40,13 @@ def test_by_default_the_joints_are_at_their_targets_at_once_and_at_rest() -> Non
     assert not state.ee_velocity.any()
 
 
-def test_a_teleport_does_not_collide_on_its_way() -> None:
+def test_a_teleport_does_not_collide_between_its_ends() -> None:
     backend = _backend()
     backend.reset(np.array([PATH_ENDS[0]]))
     assert not backend.step(np.array([PATH_ENDS[1]])).collided[0]
 
 
-def test_a_teleport_says_what_the_checker_says() -> None:
+def test_a_teleport_collides_where_the_checker_says() -> None:
     q = uniform_q(robot_model("mara"), 40, 1)
     backend = _backend(40)
     backend.reset(np.zeros((40, 6)))
@@ -54,7 +54,7 @@ def test_a_teleport_says_what_the_checker_says() -> None:
     np.testing.assert_array_equal(backend.step(q).collided, expected)
 
 
-def test_the_joints_travel_so_far_a_period_and_arrive_exactly() -> None:
+def test_joints_move_at_the_given_velocity_and_arrive_exactly() -> None:
     backend = _backend(max_joint_velocity=VELOCITY)
     backend.reset(np.zeros((1, 6)))
     target = np.array([[-0.0333, 0.0001, 0.02, 0.0, -0.015, 0.105]])
@@ -62,7 +62,7 @@ def test_the_joints_travel_so_far_a_period_and_arrive_exactly() -> None:
         state = backend.step(target)
         assert not state.collided[0]
         np.testing.assert_allclose(
-            state.q, _on_the_way(np.zeros(6), target, number * TRAVEL), rtol=0.0, atol=1e-12
+            state.q, _travelled(np.zeros(6), target, number * TRAVEL), rtol=0.0, atol=1e-12
         )
         left = np.abs(target) - number * TRAVEL
         moving, arrived = left > 1e-9, left < 1e-9
@@ -73,7 +73,7 @@ def test_the_joints_travel_so_far_a_period_and_arrive_exactly() -> None:
     assert not state.ee_velocity.any()
 
 
-def test_the_velocity_of_the_tool_is_the_change_of_its_position() -> None:
+def test_the_velocity_of_the_tool_is_the_derivative_of_its_position() -> None:
     backend = _backend(20, max_joint_velocity=1.0, control_period=1e-5)
     start, target = uniform_q(backend.robot, 20, 2), uniform_q(backend.robot, 20, 3)
     backend.reset(start)
@@ -86,9 +86,9 @@ def test_the_velocity_of_the_tool_is_the_change_of_its_position() -> None:
     assert (np.linalg.norm(states[1].ee_velocity[free], axis=1) > 1e-3).all()
 
 
-def test_a_way_whose_ends_are_free_but_whose_middle_is_not_ends_at_the_contact() -> None:
+def test_a_path_that_collides_between_its_free_ends_stops_at_the_contact() -> None:
     start, target = np.array(PATH_ENDS)
-    # The whole way in one period.
+    # The whole path in one period.
     backend = _backend(max_joint_velocity=10.0, control_period=1.0)
     backend.reset(start[None])
     assert not backend.state.collided[0]
@@ -108,31 +108,31 @@ def test_a_way_whose_ends_are_free_but_whose_middle_is_not_ends_at_the_contact()
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_an_arm_stops_at_the_first_contact_of_its_way(seed: int) -> None:
+def test_an_arm_stops_at_the_first_contact_on_its_path(seed: int) -> None:
     backend = _backend(max_joint_velocity=10.0, control_period=1.0)
     checker = make_checker("coal", backend.robot)
     free = uniform_q(backend.robot, 20, seed)
     start, target = free[~checker.check(free)][:2]
     travels = np.linspace(0.0, np.abs(target - start).max(), 1500)
-    hits = checker.check(np.array([_on_the_way(start, target, travel) for travel in travels]))
+    hits = checker.check(np.array([_travelled(start, target, travel) for travel in travels]))
     backend.reset(start[None])
     state = backend.step(target[None])
     if not state.collided[0]:
         np.testing.assert_array_equal(state.q[0], target)
-        # A touch shorter than the way between two checks may go unseen.
+        # A contact shorter than the distance between two checks may be missed.
         depth = hits.sum() * (travels[1] - travels[0]) * backend.robot.reach.sum()
         assert depth <= backend.path_resolution + 2 * travels[1] * backend.robot.reach.sum()
         return
     assert checker.check(state.q)[0]
     travelled = np.abs(state.q[0] - start).max()
     np.testing.assert_allclose(
-        state.q[0], _on_the_way(start, target, travelled), rtol=0.0, atol=1e-12
+        state.q[0], _travelled(start, target, travelled), rtol=0.0, atol=1e-12
     )
     before = hits[travels < travelled - travels[1]]
     assert before.sum() * travels[1] * backend.robot.reach.min() <= backend.path_resolution
 
 
-def test_one_arm_stops_and_the_others_go_on() -> None:
+def test_one_arm_stops_and_the_others_continue() -> None:
     backend = _backend(2, max_joint_velocity=10.0, control_period=1.0)
     backend.reset(np.array([PATH_ENDS[0], PATH_ENDS[0]]))
     target = np.array([PATH_ENDS[1], np.zeros(6)])
@@ -155,7 +155,7 @@ def test_a_finer_path_resolution_stops_nearer_to_the_contact() -> None:
     assert stops[0] > stops[2]
 
 
-def test_at_the_contact_the_arm_can_go_back() -> None:
+def test_an_arm_in_contact_can_move_back() -> None:
     backend = _backend(max_joint_velocity=10.0, control_period=1.0)
     backend.reset(np.array([PATH_ENDS[0]]))
     backend.step(np.array([PATH_ENDS[1]]))
@@ -170,10 +170,10 @@ def test_without_a_checker_nothing_collides() -> None:
 
 
 @pytest.mark.parametrize("name", ["mara", "ur5", "panda"])
-def test_to_look_for_room_around_a_path_changes_no_answer(name: str) -> None:
+def test_checking_the_middle_of_a_path_with_a_margin_changes_no_result(name: str) -> None:
     robot, rng = robot_model(name), np.random.default_rng(0)
     backend, sampling = (PinocchioBackend(robot, 32, max_joint_velocity=1.57) for _ in range(2))
-    sampling._with_room = None
+    sampling._with_margin = None
     counts = [_count_checks(each) for each in (backend, sampling)]
     hits = 0
     for period in range(60):
@@ -181,21 +181,21 @@ def test_to_look_for_room_around_a_path_changes_no_answer(name: str) -> None:
             start, target = uniform_q(robot, 32, period), uniform_q(robot, 32, period + 1)
             for each in (backend, sampling):
                 each.reset(start)
-        if period % 20 == 15:  # some arms rest, near where they are
+        if period % 20 == 15:  # short paths
             target = backend.state.q + rng.uniform(-0.01, 0.01, target.shape)
             target = target.clip(robot.lower, robot.upper)
         state = backend.step(target)
         assert_same_state(state, sampling.step(target))
         hits += int(state.collided.sum())
     assert 0 < hits < 60 * 32
-    assert sum(counts[0]) < 0.7 * sum(counts[1]), "it spares something"
+    assert sum(counts[0]) < 0.7 * sum(counts[1]), "fewer exact checks"
 
 
 def _count_checks(backend: PinocchioBackend) -> list[int]:
-    """How many configurations the backend's exact checker is asked about, call by call."""
+    """The number of configurations that the backend's exact checker checks, call by call."""
     counts, check = [], backend._checker.check
 
-    def counted(q: Floats) -> NDArray[np.bool_]:
+    def counted(q: Floats) -> Mask:
         counts.append(len(q))
         return check(q)
 

@@ -20,8 +20,9 @@ import psutil
 import pytest
 
 from gym_mara.backends import Backend, make_backend
+from gym_mara.backends.processes import WorkerDiedError
 from gym_mara.backends.servo import SimulationDivergedError
-from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
+from gym_mara.backends.workers import WorkerBackend
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
@@ -305,7 +306,9 @@ def test_a_forked_process_neither_uses_nor_ends_the_workers() -> None:
     backends = [_troubled()]
 
     def use_and_drop() -> None:
-        with pytest.raises(GymMaraError, match="worker processes of another process"):
+        with pytest.raises(
+            GymMaraError, match="belong to the process that this one was forked from"
+        ):
             backends[0].step(STILL)
         backends[0].close()
         backends.clear()
@@ -400,3 +403,20 @@ def test_a_program_whose_main_module_has_no_guard_ends_with_an_error(tmp_path: P
     assert done.returncode != 0
     assert "put what the program does under `if __name__ == '__main__':`" in done.stderr
     assert "WorkerDiedError" in done.stderr
+
+
+class UnmakableBackend(FakeBackend):
+    """Cannot be made for two arms."""
+
+    def __init__(self, robot: RobotModel, num_envs: int) -> None:
+        if num_envs == 2:
+            raise FileNotFoundError("no licence")
+        super().__init__(robot, num_envs)
+
+
+def test_an_error_while_a_block_is_made_is_raised_as_itself(mara: RobotModel) -> None:
+    with pytest.raises(FileNotFoundError, match="no licence") as caught:
+        WorkerBackend(UnmakableBackend, mara, 4, 2, {})
+    assert "in __init__" in str(caught.value.__cause__)
+    del caught
+    assert not multiprocessing.active_children()

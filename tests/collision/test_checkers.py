@@ -109,7 +109,7 @@ def test_flags_are_never_changed_by_later_calls(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("duplicate", COPIES)
-def test_a_copy_says_the_same(
+def test_a_copy_gives_the_same_answers(
     engine: str, duplicate: Callable[[CollisionChecker], CollisionChecker]
 ) -> None:
     q = uniform_q(robot_model("mara"), 20, 5)
@@ -127,7 +127,7 @@ def test_two_checkers_of_one_robot_do_not_disturb_each_other(mara: RobotModel) -
 
 
 @pytest.mark.parametrize("name", ["mara", "ur5"])
-def test_to_remember_where_there_was_room_changes_no_answer(name: str) -> None:
+def test_caching_changes_no_answer(name: str) -> None:
     robot, exact = robot_model(name), _checker("coal", name)
     assert isinstance(exact, CoalChecker)
     checker = CachedChecker(robot, CoalChecker(robot))
@@ -143,11 +143,11 @@ def test_to_remember_where_there_was_room_changes_no_answer(name: str) -> None:
         np.testing.assert_array_equal(checker.check(q), expected)
         asked, hits = asked + len(q), hits + int(expected.sum())
     assert 0 < hits < asked
-    assert checker._exact.asked < 0.9 * asked, "it spares something"
+    assert checker._exact.asked < 0.9 * asked, "it saves checks"
 
 
 class SpiedChecker(CoalChecker):
-    """Counts what it is asked."""
+    """Counts the configurations that it checks."""
 
     asked = 0
 
@@ -156,7 +156,7 @@ class SpiedChecker(CoalChecker):
         return super().check(q)
 
 
-def test_arms_that_stay_with_room_around_them_are_not_checked(mara: RobotModel) -> None:
+def test_arms_that_stay_in_free_places_are_not_checked(mara: RobotModel) -> None:
     spied = SpiedChecker(mara)
     checker = CachedChecker(mara, spied)
     q = np.tile(TARGET_Q, (16, 1))
@@ -176,6 +176,10 @@ def test_an_unknown_engine_is_named_with_the_known_ones(mara: RobotModel) -> Non
 
 
 @pytest.mark.parametrize(("engine", "threads"), [("coal", 0), ("coal", -1), ("fcl", 2)])
-def test_threads_that_an_engine_does_not_have(mara: RobotModel, engine: str, threads: int) -> None:
-    with pytest.raises(GymMaraError, match=f"at least 1, and 1 but for 'coal'; not {threads} for"):
+def test_an_engine_refuses_threads_that_it_does_not_support(
+    mara: RobotModel, engine: str, threads: int
+) -> None:
+    with pytest.raises(
+        GymMaraError, match=f"at least 1, .* unless collision='coal'; not {threads} with"
+    ):
         make_checker(engine, mara, threads)

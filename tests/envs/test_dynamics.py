@@ -1,4 +1,4 @@
-"""The environments on the dynamic backend: what they say of forces, contacts and random parameters."""
+"""The environments on the dynamic backend: torques, contacts, random parameters and divergence."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ RANGES = {
 STILL = np.zeros(6, np.float32)
 
 
-def _course(env: MaraEnv, steps: int, seed: int = 0) -> list[Any]:
+def _steps(env: MaraEnv, count: int, seed: int = 0) -> list[Any]:
+    """The results of random actions."""
     rng = np.random.default_rng(seed)
-    return [env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32)) for _ in range(steps)]
+    return [env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32)) for _ in range(count)]
 
 
 @pytest.mark.filterwarnings("ignore:.*has a wrapper applied")
 @pytest.mark.parametrize("name", ENV_IDS)
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
 @pytest.mark.parametrize("options", [{}, {"randomisation": RANGES}], ids=["plain", "random"])
-def test_with_rescaled_actions_the_checkers_ask_for_nothing(
+def test_the_checkers_accept_the_environments_with_rescaled_actions(
     name: str, check: Callable[[gymnasium.Env[Any, Any]], None], options: dict[str, Any]
 ) -> None:
     env = gymnasium.make(name, backend="dart", disable_env_checker=True, **options)
@@ -48,7 +49,7 @@ def test_with_rescaled_actions_the_checkers_ask_for_nothing(
     rescaled.close()
 
 
-def test_info_tells_torques_and_contacts() -> None:
+def test_info_has_torques_and_contacts() -> None:
     env = MaraEnv("MARACollision-v0", backend="dart", start_q=COLLIDING_Q, on_collision="continue")
     _, info = env.reset(seed=0)
     assert info["contacts"]
@@ -59,7 +60,7 @@ def test_info_tells_torques_and_contacts() -> None:
     assert "table" in {link for contact in info["contacts"] for link in contact["links"]}
 
 
-def test_a_collision_sends_the_arm_back_to_its_start() -> None:
+def test_a_collision_resets_the_arm_to_its_start() -> None:
     env = MaraEnv("MARACollision-v0", backend="dart")
     env.reset()
     for _ in range(200):
@@ -73,7 +74,7 @@ def test_a_collision_sends_the_arm_back_to_its_start() -> None:
     assert np.abs(env.step(STILL)[0][:6]).max() < 1e-6
 
 
-def test_random_parameters_are_drawn_anew_for_each_episode_from_the_seed() -> None:
+def test_each_episode_draws_new_random_parameters_from_the_seed() -> None:
     env = MaraEnv(backend="dart", randomisation=RANGES)
     drawn = []
     for seed in (3, None, None, 3, None):
@@ -88,7 +89,7 @@ def test_random_parameters_are_drawn_anew_for_each_episode_from_the_seed() -> No
     assert str({name: np.array(later[name]) for name in RANGES}) == str(drawn[4])
 
 
-def test_a_collision_does_not_draw_them_anew() -> None:
+def test_a_collision_draws_no_new_parameters() -> None:
     env = MaraEnv("MARACollision-v0", backend="dart", randomisation={"mass": (0.8, 1.2)})
     _, info = env.reset(seed=0)
     for _ in range(200):
@@ -102,9 +103,9 @@ def test_a_collision_does_not_draw_them_anew() -> None:
 def test_without_ranges_nothing_is_random() -> None:
     env = MaraEnv(backend="dart")
     env.reset(seed=0)
-    first = str(_course(env, 5))
+    first = str(_steps(env, 5))
     env.reset(seed=1)
-    assert str(_course(env, 5)) == first
+    assert str(_steps(env, 5)) == first
 
 
 def test_latency_delays_the_effect_of_an_action() -> None:
@@ -113,26 +114,28 @@ def test_latency_delays_the_effect_of_an_action() -> None:
     moved = [np.abs(env.step(STILL + 0.5)[0][:6]).max() for _ in range(4)]
     assert moved[0] < 1e-6
     assert moved[1] < 1e-6
-    np.testing.assert_allclose(moved[2], 0.010 * 1.57, rtol=0.1)  # 10 of 20 ms are left
+    np.testing.assert_allclose(
+        moved[2], 0.010 * 1.57, rtol=0.1
+    )  # 10 of 20 ms remain after the delay
     np.testing.assert_allclose(moved[3], 0.030 * 1.57, rtol=0.1)
 
 
-def test_sensor_noise_is_seen_and_not_rewarded() -> None:
+def test_sensor_noise_changes_the_observation_but_not_the_reward() -> None:
     env = MaraEnv(backend="dart", randomisation={"sensor_noise": (0.01, 0.01)})
-    quiet = MaraEnv(backend="dart")
+    noiseless = MaraEnv(backend="dart")
     env.reset(seed=0)
-    quiet.reset(seed=0)
-    seen = []
+    noiseless.reset(seed=0)
+    measured = []
     for _ in range(200):
         observation, reward, _, _, info = env.step(STILL)
-        _, true_reward, _, _, true_info = quiet.step(STILL)
+        _, true_reward, _, _, true_info = noiseless.step(STILL)
         assert reward == true_reward
         assert info["distance"] == true_info["distance"]
-        seen.append(observation[:6])
-    np.testing.assert_allclose(np.std(seen, axis=0), 0.01, rtol=0.25)
+        measured.append(observation[:6])
+    np.testing.assert_allclose(np.std(measured, axis=0), 0.01, rtol=0.25)
 
 
-def test_arms_whose_first_episode_has_not_begun_do_not_disturb_the_others() -> None:
+def test_arms_without_a_first_episode_do_not_affect_the_others() -> None:
     envs = MaraVectorEnv(2, backend="dart", randomisation={"sensor_noise": (0.01, 0.01)}, workers=1)
     envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
     observation, *_ = envs.step(np.zeros((2, 6)))
@@ -141,33 +144,36 @@ def test_arms_whose_first_episode_has_not_begun_do_not_disturb_the_others() -> N
 
 
 @pytest.mark.parametrize("duplicate", COPIES)
-def test_a_copy_in_mid_episode_goes_on_identically(duplicate: Callable[[MaraEnv], MaraEnv]) -> None:
+def test_a_copy_in_mid_episode_continues_identically(
+    duplicate: Callable[[MaraEnv], MaraEnv],
+) -> None:
     env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
     env.reset(seed=0)
-    _course(env, 5)
+    _steps(env, 5)
     other = duplicate(env)
-    assert str(_course(env, 10, seed=1)) == str(_course(other, 10, seed=1))
+    assert str(_steps(env, 10, seed=1)) == str(_steps(other, 10, seed=1))
     assert str(env.reset()) == str(other.reset())
 
 
-def test_it_goes_back_to_a_saved_state() -> None:
+def test_restore_state_returns_to_a_snapshot() -> None:
     env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
     env.reset(seed=0)
-    _course(env, 5)
+    _steps(env, 5)
     snapshot = env.save_state()
-    first = str(_course(env, 10, seed=1))
+    first = str(_steps(env, 10, seed=1))
     env.reset()
     env.restore_state(snapshot)
-    assert str(_course(env, 10, seed=1)) == first
+    assert str(_steps(env, 10, seed=1)) == first
 
 
 def _diverge(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
+    """Give an arm so large a velocity that its state diverges in the next step."""
     backend = env.simulation.backend
     assert isinstance(backend, DartBackend)
     backend.arms[arm].set_state(np.zeros(6), np.full(6, 1e200))
 
 
-def test_a_simulation_that_diverges_ends_in_an_error() -> None:
+def test_divergence_raises_an_error_by_default() -> None:
     env = MaraEnv(backend="dart")
     env.reset()
     _diverge(env)
@@ -175,7 +181,7 @@ def test_a_simulation_that_diverges_ends_in_an_error() -> None:
         env.step(STILL)
 
 
-def test_or_truncates_the_episode_and_nothing_is_nan() -> None:
+def test_divergence_can_truncate_the_episode_and_gives_no_nan() -> None:
     env = MaraEnv("MARACollisionOrient-v0", backend="dart", on_divergence="truncate")
     env.reset()
     env.step(STILL + 0.1)
@@ -188,7 +194,7 @@ def test_or_truncates_the_episode_and_nothing_is_nan() -> None:
     assert not env.step(STILL + 0.1)[3]
 
 
-def test_in_a_vector_env_only_the_arm_that_diverged_begins_anew() -> None:
+def test_in_a_vector_env_only_the_diverged_arm_begins_a_new_episode() -> None:
     envs = MaraVectorEnv(
         3, backend="dart", on_divergence="truncate", autoreset_mode="SameStep", workers=1
     )
@@ -205,7 +211,7 @@ def test_in_a_vector_env_only_the_arm_that_diverged_begins_anew() -> None:
     assert (observation[[0, 2], :6] > 0.05).all()
 
 
-def test_dart_that_is_not_installed_is_named_with_its_extra(
+def test_the_error_for_missing_dart_names_the_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     import sys

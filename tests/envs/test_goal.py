@@ -1,4 +1,4 @@
-"""Targets that are drawn, and goals that can be exchanged afterwards."""
+"""Random targets, and the goal environment."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RANDOM = "MARARandomTarget-v0"
 ORIENT: dict[str, Any] = {"orientation": True}
 
 
-def test_each_episode_has_a_target_of_its_own_within_reach() -> None:
+def test_each_episode_has_a_new_target_within_reach() -> None:
     env = MaraEnv(RANDOM, **ORIENT)
     targets = [env.reset(seed=0)[0][-7:], *(env.reset()[0][-7:] for _ in range(4))]
     assert len({tuple(target) for target in targets}) == 5
@@ -34,21 +34,18 @@ def test_each_episode_has_a_target_of_its_own_within_reach() -> None:
         assert angle < 1e-6
 
 
-def test_the_target_stays_during_an_episode_and_is_what_is_rewarded() -> None:
+def test_the_target_is_constant_in_an_episode_and_the_reward_uses_it() -> None:
     env = MaraEnv(RANDOM)
     target = env.reset(seed=1)[0][-3:]
-    for q in (
-        TARGET_Q,
-        COLLIDING_Q,
-        TARGET_Q,
-    ):  # a collision puts the arm back, and leaves the target
+    # A collision resets the arm, but not the target.
+    for q in (TARGET_Q, COLLIDING_Q, TARGET_Q):
         observation, _, _, _, info = env.step(np.array(q, np.float32))
         np.testing.assert_array_equal(observation[-3:], target)
         assert info["position_error"] == pytest.approx(np.linalg.norm(observation[6:9]))
         assert env.observation_space.contains(observation)
 
 
-def test_a_seed_repeats_its_targets() -> None:
+def test_the_same_seed_gives_the_same_targets() -> None:
     def targets(seed: int) -> list[Any]:
         env = MaraEnv(RANDOM)
         return [env.reset(seed=seed)[0].tolist(), env.reset()[0].tolist()]
@@ -58,7 +55,7 @@ def test_a_seed_repeats_its_targets() -> None:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_a_vector_environment_has_the_targets_of_single_ones(mode: str) -> None:
+def test_a_vector_environment_has_the_targets_of_single_environments(mode: str) -> None:
     envs = MaraVectorEnv(3, RANDOM, max_episode_steps=2, autoreset_mode=mode)
     singles = [MaraEnv(RANDOM) for _ in range(3)]
     observation, _ = envs.reset(seed=7)
@@ -84,12 +81,12 @@ def test_a_copy_keeps_its_target(copy: Any) -> None:
     np.testing.assert_array_equal(env.reset()[0], first)
 
 
-def test_a_target_of_ones_own_is_refused() -> None:
+def test_a_user_defined_target_is_refused() -> None:
     with pytest.raises(GymMaraError, match="draws its targets"):
         MaraEnv(RANDOM, target_position=(0.0, 0.3, 1.0))
 
 
-@pytest.mark.filterwarnings("ignore:.*action space", "ignore:.*symmetric")  # one's own to rescale
+@pytest.mark.filterwarnings("ignore:.*action space", "ignore:.*symmetric")  # users rescale actions
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
 @pytest.mark.parametrize("options", [{}, ORIENT, {"reward_type": "dense"}])
 def test_the_checkers_accept_the_goal_environment(check: Any, options: dict[str, Any]) -> None:
@@ -108,7 +105,7 @@ OPTIONS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("options", OPTIONS)
 @given(data=st.data())
-def test_rewards_computed_afterwards_are_those_that_were_given(
+def test_compute_reward_gives_the_rewards_of_the_steps(
     options: dict[str, Any], data: st.DataObject
 ) -> None:
     env = MaraGoalEnv(**options)
@@ -118,30 +115,30 @@ def test_rewards_computed_afterwards_are_those_that_were_given(
     achieved, desired = (
         np.array([step[0][key] for step in steps]) for key in ("achieved_goal", "desired_goal")
     )
-    given_ = [step[1] for step in steps]
+    rewards = [step[1] for step in steps]
     infos = np.array([step[4] for step in steps], dtype=object)
     np.testing.assert_allclose(
-        env.compute_reward(achieved, desired, infos), given_, rtol=0.0, atol=1e-9
+        env.compute_reward(achieved, desired, infos), rewards, rtol=0.0, atol=1e-9
     )
     one = env.compute_reward(achieved[0], desired[0], infos[0])
-    assert one == pytest.approx(given_[0], abs=1e-9)
+    assert one == pytest.approx(rewards[0], abs=1e-9)
 
 
-def test_a_goal_that_is_reached_is_a_success() -> None:
+def test_reaching_the_goal_is_a_success() -> None:
     env = MaraGoalEnv("MARAOrient-v0")
     env.reset()
     observation, reward, *_, info = env.step(np.array(TARGET_Q, np.float32))
     assert reward == 0.0
     assert info["is_success"]
-    turned = observation["desired_goal"].copy()
-    turned[3:] = (1.0, 0.0, 0.0, 0.0)
-    assert env.compute_reward(observation["achieved_goal"], turned, info) == -1.0
-    elsewhere = env.step(np.zeros(6, np.float32))
-    assert elsewhere[1] == -1.0
-    assert not elsewhere[4]["is_success"]
+    rotated = observation["desired_goal"].copy()
+    rotated[3:] = (1.0, 0.0, 0.0, 0.0)
+    assert env.compute_reward(observation["achieved_goal"], rotated, info) == -1.0
+    _, reward, *_, info = env.step(np.zeros(6, np.float32))
+    assert reward == -1.0
+    assert not info["is_success"]
 
 
-def test_hindsight_replay_learns_from_goals_that_were_not_meant() -> None:
+def test_hindsight_replay_relabels_goals_as_successes() -> None:
     env = gymnasium.wrappers.RescaleAction(
         gymnasium.make("gym_mara/MARAGoal-v0", max_episode_steps=10),
         np.float32(-1),
@@ -160,12 +157,12 @@ def test_hindsight_replay_learns_from_goals_that_were_not_meant() -> None:
     model.learn(300)
     assert isinstance(model.replay_buffer, HerReplayBuffer)
     rewards = model.replay_buffer.sample(256).rewards
-    assert rewards.max() == 0.0, "successes in hindsight"
+    assert rewards.max() == 0.0, "some relabelled goals are successes"
     assert model.replay_buffer.rewards.max() <= 0.0
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"reward_type": "shaped"}, "unknown reward_type"),
         ({"position_tolerance": 0.0}, "position_tolerance"),
@@ -173,12 +170,12 @@ def test_hindsight_replay_learns_from_goals_that_were_not_meant() -> None:
         ({"alfa": 1.0}, "Did you mean 'alpha'"),
     ],
 )
-def test_wrong_options(options: dict[str, Any], told: str) -> None:
-    with pytest.raises(GymMaraError, match=told):
+def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
         MaraGoalEnv(**options)
 
 
-def test_a_penalty_without_infos_is_told() -> None:
+def test_a_collision_penalty_without_infos_is_an_error() -> None:
     env = MaraGoalEnv(reward_type="dense", collision_penalty=True)
     observation, _ = env.reset(seed=0)
     with pytest.raises(GymMaraError, match="copy_info_dict"):

@@ -1,4 +1,4 @@
-"""Keyword arguments: each goes to its room, once."""
+"""Keyword arguments: each belongs to exactly one part of the environment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.tasks import ReachTask
 
 
-def test_each_room_gets_its_own() -> None:
+def test_each_part_receives_its_own_keyword_arguments() -> None:
     keywords = {"alpha": 4.0, "path_resolution": 0.01, "width": 320, "velocity_filter": 0.1}
     options = Options.sort("MARA-v0", "mara", None, "pinocchio", keywords)
     assert isinstance(options.task, ReachTask)
@@ -23,7 +23,7 @@ def test_each_room_gets_its_own() -> None:
 
 
 @pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
-def test_an_unknown_keyword_is_named_with_all_that_are_valid(make: type[MaraEnv]) -> None:
+def test_the_error_for_an_unknown_keyword_lists_all_valid_ones(make: type[MaraEnv]) -> None:
     with pytest.raises(
         GymMaraError, match=r"'widht' with backend 'pinocchio'\. Did you mean 'width'"
     ) as error:
@@ -34,12 +34,12 @@ def test_an_unknown_keyword_is_named_with_all_that_are_valid(make: type[MaraEnv]
 
 @dataclass(frozen=True)
 class Ambiguous(ReachTask):
-    """A task with a value that rendering has, too."""
+    """A task with a value that is also a name of a rendering setting."""
 
     width: float = 1.0
 
 
-def test_a_keyword_of_two_rooms_is_refused() -> None:
+def test_a_keyword_of_two_parts_is_refused() -> None:
     with pytest.raises(GymMaraError, match="'width' belongs to the task and the rendering"):
         MaraEnv(Ambiguous(), width=2.0)
     MaraEnv(Ambiguous()).close()

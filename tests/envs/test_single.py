@@ -1,4 +1,4 @@
-"""MaraEnv: one arm through Gymnasium's interface."""
+"""MaraEnv: one arm with Gymnasium's interface."""
 
 from __future__ import annotations
 
@@ -36,62 +36,62 @@ from tests.helpers import (
 )
 
 
-def _course(
-    env: gymnasium.Env[Any, Any], steps: int, seed: int | np.random.Generator = 0
+def _steps(
+    env: gymnasium.Env[Any, Any], count: int, seed: int | np.random.Generator = 0
 ) -> list[Any]:
-    """What random actions bring."""
+    """The results of random actions."""
     rng = np.random.default_rng(seed)
-    return [env.step(rng.uniform(-2.3, 2.3, 6)) for _ in range(steps)]
+    return [env.step(rng.uniform(-2.3, 2.3, 6)) for _ in range(count)]
 
 
-def _assert_same_course(mine: list[Any], other: list[Any]) -> None:
-    for one, two in zip(mine, other, strict=True):
-        np.testing.assert_array_equal(one[0], two[0])
-        assert one[1:] == two[1:]
+def _assert_same_steps(actual: list[Any], expected: list[Any]) -> None:
+    for one, other in zip(actual, expected, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[1:] == other[1:]
 
 
 def _messages(warned: pytest.WarningsRecorder) -> list[str]:
     return [str(warning.message) for warning in warned]
 
 
-# The checkers of others.
+# The checkers of other packages.
 
 
 @pytest.mark.filterwarnings("always")
 @pytest.mark.parametrize("name", ENV_IDS)
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
-def test_the_checkers_ask_for_nothing_but_a_normalised_action_space(
+def test_the_checkers_only_warn_of_the_action_space(
     name: str, check: Callable[[Any], None], recwarn: pytest.WarningsRecorder
 ) -> None:
     check(gymnasium.make(name).unwrapped)
     assert all("symmetric and normalized" in message for message in _messages(recwarn))
-    assert len(recwarn) == 1, "the task prescribes Box(-π, π)"
+    assert len(recwarn) == 1, "the only warning is that of the prescribed Box(-π, π)"
 
 
 @pytest.mark.filterwarnings("always")
 @pytest.mark.parametrize("name", ENV_IDS)
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
-def test_with_rescaled_actions_the_checkers_ask_for_nothing(
+def test_the_checkers_accept_rescaled_actions_without_a_warning(
     name: str, check: Callable[[Any], None], recwarn: pytest.WarningsRecorder
 ) -> None:
     check(RescaleAction(gymnasium.make(name), np.float32(-1.0), np.float32(1.0)))
-    # Gymnasium's advises against any wrapper.
+    # Gymnasium's checker warns of every wrapper.
     assert [m for m in _messages(recwarn) if "has a wrapper applied" not in m] == []
 
 
 @pytest.mark.parametrize("name", ENV_IDS)
-def test_a_course_through_every_wrapper_warns_of_nothing(name: str) -> None:
+def test_an_episode_in_the_default_wrappers_gives_no_warning(name: str) -> None:
     env = gymnasium.make(name, max_episode_steps=20)
     env.reset(seed=0)
-    course = _course(env, 20)
-    assert course[-1][3]
+    results = _steps(env, 20)
+    assert results[-1][3]
     env.close()
 
 
 # Spaces.
 
 
-def test_the_action_space_is_prescribed() -> None:
+def test_the_action_space_is_the_prescribed_one() -> None:
     space = MaraEnv().action_space
     assert space == gymnasium.spaces.Box(-np.pi, np.pi, (6,), np.float32)
 
@@ -127,8 +127,8 @@ def test_any_finite_action_keeps_the_observation_in_its_space(
         assert env.observation_space.contains(observation)
         assert np.isfinite(reward)
         assert reward <= 10.0
-        figures = info.pop("statistics")
-        assert np.isfinite([*info.values(), *figures.values()]).all()
+        statistics = info.pop("statistics")
+        assert np.isfinite([*info.values(), *statistics.values()]).all()
 
 
 @given(arrays(np.float64, 6, elements=st.floats(-1e300, 1e300)))
@@ -139,7 +139,7 @@ def test_an_action_is_clipped_to_the_action_space_and_the_joint_limits(action: A
     np.testing.assert_array_equal(env.step(action)[0][:6], np.clip(action, -limit, limit))
 
 
-def test_an_action_may_be_a_list_and_is_left_as_it_is() -> None:
+def test_an_action_can_be_a_list_and_is_not_modified() -> None:
     env = MaraEnv()
     env.reset()
     assert env.step([0.1, 0.2, 0.3, 0.1, 0.2, 9.0])[0][:3].tolist() == [0.1, 0.2, 0.3]  # type: ignore[arg-type]
@@ -151,7 +151,7 @@ def test_an_action_may_be_a_list_and_is_left_as_it_is() -> None:
 # The episode.
 
 
-def test_at_the_target_a_step_earns_nearly_10() -> None:
+def test_the_reward_at_the_target_is_nearly_10() -> None:
     for name in TASK_NAMES:
         env = MaraEnv(name)
         env.reset()
@@ -161,7 +161,7 @@ def test_at_the_target_a_step_earns_nearly_10() -> None:
         assert not info["collided"]
 
 
-def test_an_episode_of_the_registered_length_is_truncated_there() -> None:
+def test_an_episode_is_truncated_after_the_registered_length() -> None:
     env = gymnasium.make("gym_mara/MARA-v0")
     env.reset()
     ends = [env.step(np.zeros(6))[2:4] for _ in range(2048)]
@@ -169,7 +169,7 @@ def test_an_episode_of_the_registered_length_is_truncated_there() -> None:
     assert ends[-1] == (False, True)
 
 
-def test_reset_goes_to_the_start_pose() -> None:
+def test_reset_moves_the_arm_to_the_start_configuration() -> None:
     start = (0.1, -0.2, 0.3, -0.4, 0.5, -0.6)
     env = MaraEnv(start_q=start)
     first, info = env.reset()
@@ -179,7 +179,7 @@ def test_reset_goes_to_the_start_pose() -> None:
     np.testing.assert_array_equal(env.reset()[0], first)
 
 
-def test_info_says_the_terms_of_the_reward_as_plain_values() -> None:
+def test_info_has_the_terms_of_the_reward_as_plain_values() -> None:
     env = MaraEnv("MARACollisionOrient-v0")
     env.reset()
     _, reward, _, _, info = env.step(np.array(COLLIDING_Q))
@@ -203,7 +203,7 @@ def test_info_says_the_terms_of_the_reward_as_plain_values() -> None:
 
 
 def _collide(on_collision: str, **options: Any) -> tuple[MaraEnv, Any]:
-    """An arm in steady motion that has just collided, and that step's result."""
+    """An arm that has just collided in motion, and the result of that step."""
     env = MaraEnv("MARACollision-v0", on_collision=on_collision, start_q=PATH_ENDS[0], **options)
     env.reset()
     for _ in range(2000):
@@ -214,13 +214,13 @@ def _collide(on_collision: str, **options: Any) -> tuple[MaraEnv, Any]:
 
 
 @pytest.mark.parametrize("on_collision", ["reset", "terminate", "continue"])
-def test_observation_and_reward_of_a_collision_are_those_of_the_colliding_pose(
+def test_observation_and_reward_of_a_collision_show_the_colliding_configuration(
     on_collision: str,
 ) -> None:
     env, (observation, reward, terminated, truncated, info) = _collide(
         on_collision, max_joint_velocity=1.0
     )
-    assert -1.3 < observation[3] < -1.1, "motor4 where it touches"
+    assert -1.3 < observation[3] < -1.1, "motor4 is where the links touch"
     position = env.simulation.robot.kinematics().pose(observation[None, :6])[0][0]
     error = position - env.simulation.goal.position[0]
     np.testing.assert_allclose(observation[6:9], error, rtol=0.0, atol=1e-12)
@@ -232,7 +232,7 @@ def test_observation_and_reward_of_a_collision_are_those_of_the_colliding_pose(
     assert not truncated
 
 
-def test_with_reset_the_arm_is_then_at_its_start_pose_and_the_episode_goes_on() -> None:
+def test_with_reset_a_collision_moves_the_arm_to_its_start_and_the_episode_continues() -> None:
     env, _ = _collide("reset", max_joint_velocity=1.0)
     observation, _, terminated, _, info = env.step(np.add(PATH_ENDS[0], 0.5))
     np.testing.assert_allclose(observation[:6], np.array(PATH_ENDS[0]) + 0.02, atol=1e-12)
@@ -241,10 +241,10 @@ def test_with_reset_the_arm_is_then_at_its_start_pose_and_the_episode_goes_on() 
     assert env.simulation.statistics.summary()["num_coll"][0] == 1
 
 
-def test_with_continue_the_arm_stays_where_it_touched() -> None:
-    env, (touched, *_) = _collide("continue", max_joint_velocity=1.0)
+def test_with_continue_the_arm_moves_on_from_the_collision() -> None:
+    env, (colliding, *_) = _collide("continue", max_joint_velocity=1.0)
     observation = env.step(np.array(PATH_ENDS[0]))[0]
-    assert np.abs(observation[:6] - touched[:6]).max() == pytest.approx(0.02)
+    assert np.abs(observation[:6] - colliding[:6]).max() == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("on_collision", ["reset", "terminate", "continue"])
@@ -261,7 +261,7 @@ def test_a_teleport_into_a_collision(fake_backend: str, on_collision: str) -> No
     assert env.step(np.full(6, 0.5))[4]["collided"] is False
 
 
-def test_only_the_collision_tasks_punish_one() -> None:
+def test_only_the_collision_tasks_penalise_a_collision() -> None:
     rewards = {}
     for name in TASK_NAMES:
         env = MaraEnv(name)
@@ -276,18 +276,18 @@ def test_only_the_collision_tasks_punish_one() -> None:
 
 @pytest.mark.parametrize("duplicate", COPIES)
 @pytest.mark.parametrize("options", [{}, {"max_joint_velocity": 1.0}, {"collision": "fcl"}])
-def test_a_copy_in_mid_episode_goes_on_identically(
+def test_a_copy_in_mid_episode_continues_identically(
     duplicate: Callable[[Any], Any], options: dict[str, Any]
 ) -> None:
     env = gymnasium.make("gym_mara/MARACollisionOrient-v0", max_episode_steps=15, **options)
     env.reset(seed=3)
-    _course(env, 5)
+    _steps(env, 5)
     other = duplicate(env)
-    _assert_same_course(_course(env, 10, seed=1), _course(other, 10, seed=1))
+    _assert_same_steps(_steps(env, 10, seed=1), _steps(other, 10, seed=1))
     assert env.unwrapped.np_random.random() == other.unwrapped.np_random.random()
 
 
-def test_a_copy_and_its_original_go_apart(fake_backend: str) -> None:
+def test_a_copy_is_independent_of_its_original(fake_backend: str) -> None:
     env = MaraEnv(backend=fake_backend)
     env.reset()
     other = copy.deepcopy(env)
@@ -298,64 +298,64 @@ def test_a_copy_and_its_original_go_apart(fake_backend: str) -> None:
 
 
 @pytest.mark.parametrize("velocity", [None, 1.0])
-def test_it_goes_back_to_a_saved_state(velocity: float | None) -> None:
+def test_restore_state_returns_to_a_snapshot(velocity: float | None) -> None:
     env = MaraEnv("MARACollision-v0", max_joint_velocity=velocity)
     env.reset(seed=3)
-    _course(env, 5)
+    _steps(env, 5)
     snapshot = pickled(env.save_state())
-    course, drawn = _course(env, 10, seed=1), env.np_random.random()
+    expected, drawn = _steps(env, 10, seed=1), env.np_random.random()
     other = MaraEnv("MARACollision-v0", max_joint_velocity=velocity)
     for each in (env, other, env):
         each.restore_state(snapshot)
-        _assert_same_course(_course(each, 10, seed=1), course)
+        _assert_same_steps(_steps(each, 10, seed=1), expected)
         assert each.np_random.random() == drawn
         assert each.simulation.statistics.summary()["ep_steps"].tolist() == [15]
 
 
 @pytest.mark.parametrize("name", ENV_IDS)
-def test_the_same_seed_gives_the_same_numbers(name: str) -> None:
-    courses = []
+def test_the_same_seed_gives_the_same_results(name: str) -> None:
+    runs = []
     for _ in range(2):
         env = gymnasium.make(name)
         env.action_space.seed(7)
         observation, _ = env.reset(seed=7)
         steps = [env.step(env.action_space.sample()) for _ in range(20)]
-        courses.append([(observation, 0.0, env.unwrapped.np_random.random()), *steps])
-    _assert_same_course(*courses)
+        runs.append([(observation, 0.0, env.unwrapped.np_random.random()), *steps])
+    _assert_same_steps(*runs)
 
 
-def test_two_envs_in_one_process_do_not_disturb_each_other() -> None:
+def test_two_envs_in_one_process_are_independent() -> None:
     alone = MaraEnv("MARACollision-v0")
     alone.reset(seed=0)
-    expected = _course(alone, 20)
+    expected = _steps(alone, 20)
     env, other = MaraEnv("MARACollision-v0"), MaraEnv("MARACollision-v0")
     env.reset(seed=0)
     other.reset(seed=1)
     rng = np.random.default_rng(0)
-    course: list[Any] = []
+    results: list[Any] = []
     for _ in range(20):
-        course += _course(env, 1, rng)
-        _course(other, 1, seed=5)
-    _assert_same_course(course, expected)
+        results += _steps(env, 1, rng)
+        _steps(other, 1, seed=5)
+    _assert_same_steps(results, expected)
 
 
-def test_what_a_step_returned_is_never_changed_afterwards() -> None:
+def test_later_steps_do_not_change_earlier_results() -> None:
     env = MaraEnv("MARAOrient-v0")
     first, _ = env.reset()
     kept = first.copy()
-    course = _course(env, 3)
-    copied = copy.deepcopy(course)
-    _course(env, 5, seed=1)
+    results = _steps(env, 3)
+    copied = copy.deepcopy(results)
+    _steps(env, 5, seed=1)
     env.reset()
     np.testing.assert_array_equal(first, kept)
-    _assert_same_course(course, copied)
+    _assert_same_steps(results, copied)
 
 
 # Other robots and tasks.
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
-def test_another_robot_by_its_name(name: str) -> None:
+def test_a_robot_can_be_given_by_its_name(name: str) -> None:
     env = gymnasium.make("gym_mara/MARACollisionOrient-v0", robot=name)
     joints = robot_model(name).num_joints
     observation, _ = env.reset()
@@ -364,7 +364,7 @@ def test_another_robot_by_its_name(name: str) -> None:
     assert env.observation_space.contains(env.step(env.action_space.sample())[0])
 
 
-def test_a_robot_of_ones_own_by_its_file(tmp_path: Path) -> None:
+def test_a_robot_can_be_given_by_its_urdf(tmp_path: Path) -> None:
     urdf = write(tmp_path / "stick.urdf", urdf_xml(*map(joint_xml, range(4))))
     env = gymnasium.make("gym_mara/MARA-v0", robot=str(urdf), ee_frame="link4")
     env.reset()
@@ -372,13 +372,13 @@ def test_a_robot_of_ones_own_by_its_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(observation[:4], 0.1)
 
 
-def test_a_task_of_ones_own(mara: RobotModel) -> None:
+def test_a_task_can_be_given_as_a_value(mara: RobotModel) -> None:
     env = MaraEnv(ReachTask(orientation=True, alpha=3.0), robot=mara, alpha=4.0)
     assert env.simulation.task == ReachTask(orientation=True, alpha=4.0)
     assert env.reset()[0].shape == (16,)
 
 
-def test_constants_of_the_reward_are_options() -> None:
+def test_constants_of_the_reward_are_keyword_arguments() -> None:
     env = MaraEnv("MARACollision-v0", delta=0.0)
     env.reset()
     _, reward, _, _, info = env.step(np.array(COLLIDING_Q))
@@ -392,17 +392,17 @@ def test_constants_of_the_reward_are_options() -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.zeros(5), r"the action has shape \(5,\); mara wants \(6,\)"),
-        (np.zeros((1, 6)), r"the action has shape \(1, 6\); mara wants \(6,\)"),
-        (0.0, r"the action has shape \(\); mara wants \(6,\)"),
-        (np.array([0.1] * 5 + [np.nan]), "the action holds NaN or infinity; joint targets must"),
-        (np.array([0.1] * 5 + [np.inf]), "the action holds NaN or infinity"),
-        (np.array([0.1] * 5 + [-np.inf]), "the action holds NaN or infinity"),
+        (np.zeros(5), r"the action has shape \(5,\); mara needs \(6,\)"),
+        (np.zeros((1, 6)), r"the action has shape \(1, 6\); mara needs \(6,\)"),
+        (0.0, r"the action has shape \(\); mara needs \(6,\)"),
+        (np.array([0.1] * 5 + [np.nan]), "the action contains NaN or infinity; joint targets must"),
+        (np.array([0.1] * 5 + [np.inf]), "the action contains NaN or infinity"),
+        (np.array([0.1] * 5 + [-np.inf]), "the action contains NaN or infinity"),
         (["a"] * 6, "an action must be an array of numbers"),
         (None, r"the action has shape \(\)|an action must be"),
     ],
 )
-def test_a_wrong_action_moves_nothing_and_counts_no_step(action: Any, message: str) -> None:
+def test_an_invalid_action_moves_no_joint_and_is_not_counted(action: Any, message: str) -> None:
     env = MaraEnv(max_joint_velocity=1.0)
     env.reset()
     env.step(np.full(6, 0.5))
@@ -417,7 +417,9 @@ def test_a_wrong_action_moves_nothing_and_counts_no_step(action: Any, message: s
 
 
 @pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
-def test_a_step_before_the_first_reset(make: Callable[[], MaraEnv | MaraVectorEnv]) -> None:
+def test_a_step_before_the_first_reset_is_an_error(
+    make: Callable[[], MaraEnv | MaraVectorEnv],
+) -> None:
     env = make()
     action = env.action_space.sample()
     with pytest.raises(ResetNeeded, match=r"call reset\(\) before the first step\(\)"):
@@ -427,7 +429,7 @@ def test_a_step_before_the_first_reset(make: Callable[[], MaraEnv | MaraVectorEn
 
 
 @pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
-def test_use_after_close(make: Callable[[], MaraEnv | MaraVectorEnv]) -> None:
+def test_use_after_close_is_an_error(make: Callable[[], MaraEnv | MaraVectorEnv]) -> None:
     env = make()
     env.reset()
     snapshot = env.save_state()
@@ -486,7 +488,7 @@ def test_close_closes_the_backend(
         ({"path_resolution": 0}, "path_resolution must be finite and positive"),
     ],
 )
-def test_wrong_options(
+def test_invalid_options_are_refused(
     make: Callable[..., MaraEnv | MaraVectorEnv], options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(GymMaraError, match=message):
@@ -494,7 +496,7 @@ def test_wrong_options(
 
 
 @pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
-def test_a_target_out_of_reach_warns_by_how_much_and_works(
+def test_a_target_out_of_reach_gives_a_warning_and_works(
     make: Callable[..., MaraEnv | MaraVectorEnv],
 ) -> None:
     with pytest.warns(UserWarning, match=r"out of reach of mara's 'ee_link'.* 208\.3 mm"):

@@ -1,4 +1,4 @@
-"""Statistics of an episode: the sums themselves, and what the environments report."""
+"""Statistics of an episode: the class, and the reports of the environments."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def _expected(distances: Any, rewards: Any, collided: Any) -> dict[str, float]:
 
 
 def _actions(count: int, seed: int = 0) -> Floats:
-    """A collision in about every third."""
+    """Random actions (count, 6), rad; about every third leads to a collision."""
     return np.random.default_rng(seed).uniform(-2.3, 2.3, (count, 6))
 
 
-def test_they_are_the_extremes_the_mean_and_the_number_of_collisions() -> None:
+def test_the_summary_has_the_extremes_the_means_and_the_counts() -> None:
     statistics = EpisodeStatistics(2)
     statistics.add(np.array([0.3, 1.0]), np.array([-1.0, 5.0]), np.array([True, False]))
     statistics.add(np.array([0.1, 2.0]), np.array([3.0, -4.0]), np.array([True, False]))
@@ -58,7 +58,7 @@ def test_they_are_the_extremes_the_mean_and_the_number_of_collisions() -> None:
     }
 
 
-def test_clear_begins_the_chosen_episodes_anew() -> None:
+def test_clear_resets_the_chosen_episodes() -> None:
     statistics = EpisodeStatistics(2)
     none = np.zeros(2, np.bool_)
     statistics.add(np.array([9.0, 9.0]), np.array([9.0, 9.0]), ~none)
@@ -72,7 +72,7 @@ def test_clear_begins_the_chosen_episodes_anew() -> None:
     assert summary["ep_rew_mean"].tolist() == [-2.0, 3.5]
 
 
-def test_a_summary_is_not_changed_by_what_follows() -> None:
+def test_later_steps_do_not_change_a_summary() -> None:
     statistics = EpisodeStatistics(1)
     one, yes = np.ones(1), np.array([True])
     statistics.add(one, one, yes)
@@ -82,19 +82,19 @@ def test_a_summary_is_not_changed_by_what_follows() -> None:
     assert {name: values.item() for name, values in summary.items()} == _expected([1], [1], [1])
 
 
-def test_those_of_one_episode_are_its_part_of_the_summary_as_plain_numbers() -> None:
+def test_the_statistics_of_one_episode_are_plain_numbers_from_the_summary() -> None:
     statistics = EpisodeStatistics(3)
     rng = np.random.default_rng(0)
     for _ in range(4):
         statistics.add(rng.random(3), rng.normal(size=3), rng.random(3) < 0.5)
     for episode in range(3):
-        figures = statistics.of(episode)
-        assert {type(value) for value in figures.values()} == {int, float}
-        assert figures == {n: values[episode] for n, values in statistics.summary().items()}
+        single = statistics.of(episode)
+        assert {type(value) for value in single.values()} == {int, float}
+        assert single == {n: values[episode] for n, values in statistics.summary().items()}
 
 
 @pytest.mark.parametrize("duplicate", COPIES)
-def test_a_copy_goes_on_apart(
+def test_a_copy_is_independent_of_its_original(
     duplicate: Callable[[EpisodeStatistics], EpisodeStatistics],
 ) -> None:
     statistics = EpisodeStatistics(1)
@@ -106,7 +106,7 @@ def test_a_copy_goes_on_apart(
     assert other.of(0) == _expected([1, 3], [1, 5], [1, 0])
 
 
-def test_a_single_env_reports_those_of_the_episode_so_far() -> None:
+def test_a_single_env_reports_the_statistics_of_the_episode_so_far() -> None:
     env = gymnasium.make("gym_mara/MARACollisionOrient-v0", max_episode_steps=STEPS)
     for episode in range(3):
         env.reset()
@@ -125,7 +125,7 @@ def test_a_single_env_reports_those_of_the_episode_so_far() -> None:
         assert sum(collisions) > 0
 
 
-def test_a_termination_ends_the_episode_with_its_statistics(fake_backend: str) -> None:
+def test_a_terminated_episode_has_statistics(fake_backend: str) -> None:
     env = gymnasium.make(
         "gym_mara/MARA-v0", backend=fake_backend, on_collision="terminate", max_episode_steps=9
     )
@@ -142,7 +142,7 @@ def _make_vec(**options: Any) -> VectorEnv[Any, Any, Any]:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_a_vector_env_reports_them_at_the_end_of_each_episode(mode: str) -> None:
+def test_a_vector_env_reports_statistics_at_the_end_of_each_episode(mode: str) -> None:
     env = _make_vec(max_episode_steps=STEPS, autoreset_mode=mode)
     env.reset()
     for episode in range(2):
@@ -162,9 +162,9 @@ def test_a_vector_env_reports_them_at_the_end_of_each_episode(mode: str) -> None
         assert final["_statistics"].all()
         assert {name for name in statistics if not name.startswith("_")} == NAMES
         for arm in range(3):
-            mine = {name: statistics[name][arm].item() for name in NAMES}
+            of_arm = {name: statistics[name][arm].item() for name in NAMES}
             expected = _expected(*(np.array(v)[:, arm] for v in (distances, rewards, collisions)))
-            assert mine == pytest.approx(expected)
+            assert of_arm == pytest.approx(expected)
         if mode == "NextStep":
             _, reward, _, truncated, info = env.step(_actions(3))
             assert not truncated.any()
@@ -174,7 +174,7 @@ def test_a_vector_env_reports_them_at_the_end_of_each_episode(mode: str) -> None
             env.reset(options={"reset_mask": np.ones(3, np.bool_)})
 
 
-def test_an_arm_that_begins_anew_counts_anew(fake_backend: str) -> None:
+def test_the_statistics_of_a_new_episode_start_from_zero(fake_backend: str) -> None:
     env = _make_vec(
         backend=fake_backend,
         on_collision="terminate",

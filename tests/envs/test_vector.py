@@ -1,4 +1,4 @@
-"""MaraVectorEnv: the numbers of single environments, for which Gymnasium's SyncVectorEnv is the referee."""
+"""MaraVectorEnv: it gives the results of single environments, compared with Gymnasium's SyncVectorEnv."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VecEnv = VectorEnv[Any, Any, Any]
 
 
 def _pair(name: str, count: int, mode: str, **options: Any) -> tuple[MaraVectorEnv, VecEnv]:
-    """The native vector env, and Gymnasium's own over single envs."""
+    """The native vector env, and Gymnasium's SyncVectorEnv of single envs."""
     native = gymnasium.make_vec(name, num_envs=count, autoreset_mode=mode, **options)
     assert type(native) is MaraVectorEnv
     singles = gymnasium.make_vec(
@@ -40,9 +40,9 @@ def _pair(name: str, count: int, mode: str, **options: Any) -> tuple[MaraVectorE
 
 
 def _assert_same_info(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
-    """Equal masks; equal values where the masks are set, dictionaries by their own masks.
+    """Both have equal masks, and equal values where a mask is set; dictionaries are compared recursively.
 
-    But `statistics`, which single envs report at every step, come at the end of an episode only.
+    An exception are `statistics`: single envs report them at every step, the vector env only at the end of an episode.
     """
     for key in {k for k in (*mine, *theirs) if not k.startswith("_")}:
         mask = mine[f"_{key}"] if f"_{key}" in mine else np.zeros(0, np.bool_)
@@ -71,15 +71,15 @@ def _assert_same_info(mine: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert not mine[key][~mask].any()
 
 
-def _assert_same_course(native: VecEnv, singles: VecEnv, steps: int, limit: float = 2.5) -> None:
-    """Both take the same random actions; every number agrees, and something of each kind happens."""
+def _assert_same_results(native: VecEnv, singles: VecEnv, steps: int, limit: float = 2.5) -> None:
+    """Both give the same results for the same random actions, with at least one collision and one end of an episode."""
     rng = np.random.default_rng(0)
     observation, _ = native.reset(seed=3)
     np.testing.assert_allclose(observation, singles.reset(seed=3)[0], rtol=0.0, atol=1e-12)
     collisions = ends = 0
     target = np.zeros(native.action_space.shape or ())
     for _ in range(steps):
-        # Some joints rest: the arms' ways differ in length.
+        # Some joints rest, so that the paths of the arms differ in length.
         moves = rng.random(target.shape) < rng.random((len(target), 1))
         target = np.where(moves, rng.uniform(-limit, limit, target.shape), target)
         mine, theirs = native.step(target), singles.step(target)
@@ -95,8 +95,8 @@ def _assert_same_course(native: VecEnv, singles: VecEnv, steps: int, limit: floa
         ends += int(np.sum(mine[2] | mine[3]))
         ended = mine[2] | mine[3]
         reported = mine[4].get("final_info", {}) if "final_info" in mine[4] else mine[4]
-        nothing = np.zeros(len(ended), np.bool_)
-        np.testing.assert_array_equal(reported.get("_statistics", nothing), ended)
+        no_arm = np.zeros(len(ended), np.bool_)
+        np.testing.assert_array_equal(reported.get("_statistics", no_arm), ended)
     assert collisions > 0
     assert ends > 0
     native.close()
@@ -107,7 +107,7 @@ def _assert_same_course(native: VecEnv, singles: VecEnv, steps: int, limit: floa
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("on_collision", ON_COLLISION)
 @pytest.mark.parametrize("velocity", [None, 5.0], ids=["teleport", "travel"])
-def test_it_gives_the_numbers_of_single_envs(
+def test_it_gives_the_results_of_single_envs(
     mara: RobotModel, count: int, mode: str, on_collision: str, velocity: float | None
 ) -> None:
     native, singles = _pair(
@@ -120,32 +120,32 @@ def test_it_gives_the_numbers_of_single_envs(
         control_period=0.1,
         max_episode_steps=9,
     )
-    _assert_same_course(native, singles, 25 if count == 40 else 40)
+    _assert_same_results(native, singles, 25 if count == 40 else 40)
 
 
 @pytest.mark.parametrize("name", ENV_IDS)
-def test_every_id_gives_the_numbers_of_single_envs(mara: RobotModel, name: str) -> None:
+def test_every_id_gives_the_results_of_single_envs(mara: RobotModel, name: str) -> None:
     native, singles = _pair(name, 3, "NextStep", robot=mara, max_episode_steps=6)
-    _assert_same_course(native, singles, 20)
+    _assert_same_results(native, singles, 20)
 
 
 @pytest.mark.parametrize("on_collision", ON_COLLISION)
-def test_another_backend_gives_the_numbers_of_single_envs(
+def test_another_backend_gives_the_results_of_single_envs(
     mara: RobotModel, fake_backend: str, on_collision: str
 ) -> None:
     options = {"robot": mara, "backend": fake_backend, "on_collision": on_collision}
     native, singles = _pair("gym_mara/MARA-v0", 3, "SameStep", max_episode_steps=6, **options)
-    _assert_same_course(native, singles, 20)
+    _assert_same_results(native, singles, 20)
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("count", [3, 4])
-def test_random_episodes_of_the_dynamic_backend_are_those_of_single_envs(
+def test_random_episodes_of_the_dynamic_backend_equal_those_of_single_envs(
     mara: RobotModel, mode: str, count: int
 ) -> None:
     ranges = {"mass": (0.5, 1.5), "latency": (0.0, 0.05), "sensor_noise": (0.0, 0.01)}
     options = {"robot": mara, "backend": "dart", "randomisation": ranges}
-    start = (1.4, 1.9, 0.0, 0.0, 0.0, 0.0)  # close above the table
+    start = (1.4, 1.9, 0.0, 0.0, 0.0, 0.0)  # just above the table
     native, singles = _pair(
         "gym_mara/MARACollisionOrient-v0",
         count,
@@ -154,13 +154,13 @@ def test_random_episodes_of_the_dynamic_backend_are_those_of_single_envs(
         start_q=start,
         **options,
     )
-    _assert_same_course(native, singles, 20)
+    _assert_same_results(native, singles, 20)
 
 
-def test_a_half_turn_from_the_target_shows_the_same_axis_as_in_a_single_env() -> None:
-    """There w is zero but for rounding, which must not choose the sign of the rest."""
+def test_the_orientation_error_of_a_half_turn_equals_that_of_a_single_env() -> None:
+    """There w is zero except for rounding, and rounding must not change the sign of the other components."""
     q = np.random.default_rng(0).uniform(-0.7, 0.7, (100, 6))
-    # motor2 and motor3 cancel: the tool points straight up.
+    # motor2 and motor3 cancel each other, so that the tool points straight up.
     q[:, 2], q[:, 4:] = q[:, 1], 0.0
     batch, single = MaraVectorEnv(100, "MARAOrient-v0"), MaraEnv("MARAOrient-v0")
     batch.reset()
@@ -172,7 +172,7 @@ def test_a_half_turn_from_the_target_shows_the_same_axis_as_in_a_single_env() ->
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_its_spaces_are_batches_of_the_single_envs(name: str) -> None:
+def test_the_spaces_are_batches_of_the_single_envs_spaces(name: str) -> None:
     env = MaraVectorEnv(5, name)
     single = gymnasium.make(f"gym_mara/{name}")
     assert env.single_observation_space == single.observation_space
@@ -188,18 +188,18 @@ def _random_actions(count: int, steps: int, seed: int = 0) -> Floats:
     return np.random.default_rng(seed).uniform(-2.3, 2.3, (steps, count, 6))
 
 
-def test_what_a_step_returned_is_never_changed_afterwards() -> None:
+def test_later_steps_do_not_change_earlier_results() -> None:
     env = MaraVectorEnv(3, "MARACollisionOrient-v0", max_episode_steps=3)
     returned: list[Any] = [env.reset()]
     for actions in _random_actions(3, 10):
         returned.append(env.step(actions))
         if len(returned) == 5:
-            kept = copy.deepcopy(returned)
-    assert str(returned[:5]) == str(kept)
-    np.testing.assert_array_equal(returned[0][0], kept[0][0])
+            copied = copy.deepcopy(returned)
+    assert str(returned[:5]) == str(copied)
+    np.testing.assert_array_equal(returned[0][0], copied[0][0])
 
 
-def test_next_step_begins_an_episode_a_step_later_and_ignores_that_action() -> None:
+def test_next_step_resets_in_the_next_step_and_ignores_its_action() -> None:
     env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="NextStep")
     start, _ = env.reset()
     env.step(np.full((2, 6), 0.1))
@@ -208,12 +208,12 @@ def test_next_step_begins_an_episode_a_step_later_and_ignores_that_action() -> N
     np.testing.assert_allclose(last[:, :6], 0.2)
     observation, reward, terminated, truncated, info = env.step(np.full((2, 6), 0.3))
     np.testing.assert_array_equal(observation, start)
-    for nothing in (reward, terminated, truncated):
-        assert not nothing.any()
+    for result in (reward, terminated, truncated):
+        assert not result.any()
     assert not info["_distance"].any()
 
 
-def test_same_step_shows_the_start_and_keeps_the_final_observation() -> None:
+def test_same_step_returns_the_first_observation_and_the_final_one_in_info() -> None:
     env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="SameStep")
     start, _ = env.reset()
     env.step(np.full((2, 6), 0.1))
@@ -226,17 +226,19 @@ def test_same_step_shows_the_start_and_keeps_the_final_observation() -> None:
     distance = info["final_info"]["distance"]
     expected = [np.sqrt(np.mean(final[6:9] ** 2)) for final in info["final_obs"]]
     np.testing.assert_allclose(distance, expected)
-    assert (reward == env.step(np.full((2, 6), 0.2))[1]).all(), "the reward is of the final pose"
+    assert (reward == env.step(np.full((2, 6), 0.2))[1]).all(), (
+        "the reward is that of the final state"
+    )
 
 
-def test_disabled_waits_for_the_user_to_reset() -> None:
+def test_disabled_needs_a_reset_by_the_user() -> None:
     env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="Disabled")
     start, _ = env.reset()
     env.step(np.full((2, 6), 0.1))
     env.reset(options={"reset_mask": np.array([True, False])})
     _, _, _, truncated, _ = env.step(np.full((2, 6), 0.2))
     assert truncated.tolist() == [False, True]
-    with pytest.raises(GymMaraError, match=r"episodes have ended: reset them.*reset_mask"):
+    with pytest.raises(GymMaraError, match=r"episodes have ended: call reset.*reset_mask"):
         env.step(np.full((2, 6), 0.3))
     observation, _ = env.reset(options={"reset_mask": np.array([False, True])})
     np.testing.assert_array_equal(observation[1], start[1])
@@ -244,7 +246,7 @@ def test_disabled_waits_for_the_user_to_reset() -> None:
     env.step(np.full((2, 6), 0.3))
 
 
-def test_without_a_length_an_episode_does_not_end() -> None:
+def test_without_max_episode_steps_an_episode_is_not_truncated() -> None:
     env = MaraVectorEnv(2, max_episode_steps=None, on_collision="continue")
     env.reset()
     assert not any(env.step(actions)[3].any() for actions in _random_actions(2, 20))
@@ -253,7 +255,7 @@ def test_without_a_length_an_episode_does_not_end() -> None:
 @pytest.mark.parametrize("duplicate", COPIES)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("velocity", [None, 1.0])
-def test_a_copy_goes_on_identically(
+def test_a_copy_continues_identically(
     duplicate: Callable[[MaraVectorEnv], MaraVectorEnv], mode: str, velocity: float | None
 ) -> None:
     env = MaraVectorEnv(
@@ -274,23 +276,23 @@ def test_a_copy_goes_on_identically(
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("velocity", [None, 1.0])
-def test_it_goes_back_to_a_saved_state(mode: str, velocity: float | None) -> None:
+def test_restore_state_returns_to_a_snapshot(mode: str, velocity: float | None) -> None:
     options: dict[str, Any] = {"autoreset_mode": mode, "max_joint_velocity": velocity}
     env = MaraVectorEnv(3, "MARACollision-v0", max_episode_steps=5, **options)
     env.reset(seed=1)
     for actions in _random_actions(3, 5):
         env.step(actions)
     snapshot = pickled(env.save_state())
-    course = [str(env.step(actions)) for actions in _random_actions(3, 8, seed=1)]
+    expected = [str(env.step(actions)) for actions in _random_actions(3, 8, seed=1)]
     drawn = env.np_random.random()
     other = MaraVectorEnv(3, "MARACollision-v0", max_episode_steps=5, **options)
     for each in (env, other, env):
         each.restore_state(snapshot)
-        assert [str(each.step(a)) for a in _random_actions(3, 8, seed=1)] == course
+        assert [str(each.step(a)) for a in _random_actions(3, 8, seed=1)] == expected
         assert each.np_random.random() == drawn
 
 
-def test_a_seed_may_be_given_for_each_arm() -> None:
+def test_each_arm_can_have_its_own_seed() -> None:
     env = MaraVectorEnv(2)
     env.reset(seed=[4, 5])
     drawn = env.np_random.random()
@@ -303,7 +305,7 @@ def test_a_seed_may_be_given_for_each_arm() -> None:
 @pytest.mark.parametrize(
     "mask", [[True], np.ones(2), np.zeros(2, np.bool_), np.ones((2, 1), np.bool_)]
 )
-def test_a_wrong_reset_mask(mask: Any) -> None:
+def test_an_invalid_reset_mask_is_refused(mask: Any) -> None:
     env = MaraVectorEnv(2)
     env.reset()
     with pytest.raises(GymMaraError, match=r"reset_mask must be bool, of shape \(2,\)"):
@@ -311,25 +313,25 @@ def test_a_wrong_reset_mask(mask: Any) -> None:
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "two", None])
-def test_a_wrong_number_of_envs(count: Any) -> None:
+def test_an_invalid_number_of_envs_is_refused(count: Any) -> None:
     with pytest.raises(
         GymMaraError, match=f"num_envs must be a whole number of at least 1, not {count!r}"
     ):
         MaraVectorEnv(count)
 
 
-def test_a_number_of_envs_may_be_numpys() -> None:
+def test_num_envs_can_be_a_numpy_integer() -> None:
     env = MaraVectorEnv(np.int64(2))  # type: ignore[arg-type]
     assert env.reset()[0].shape == (2, 12)
 
 
 @pytest.mark.parametrize("steps", [0, -3, 2.5, True])
-def test_a_wrong_length_of_an_episode(steps: Any) -> None:
+def test_an_invalid_max_episode_steps_is_refused(steps: Any) -> None:
     with pytest.raises(GymMaraError, match="max_episode_steps must be"):
         MaraVectorEnv(1, max_episode_steps=steps)
 
 
-def test_an_unknown_autoreset_mode_is_named_with_the_known_ones() -> None:
+def test_the_error_for_an_unknown_autoreset_mode_lists_the_valid_ones() -> None:
     with pytest.raises(GymMaraError, match=r"unknown autoreset_mode 'Never'.*Disabled, NextStep"):
         MaraVectorEnv(1, autoreset_mode="Never")
 
@@ -337,14 +339,14 @@ def test_an_unknown_autoreset_mode_is_named_with_the_known_ones() -> None:
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        (np.zeros((3, 6)), r"the action has shape \(3, 6\); mara wants \(2, 6\)"),
-        (np.zeros((2, 5)), r"the action has shape \(2, 5\); mara wants \(2, 6\)"),
-        (np.zeros(6), r"the action has shape \(6,\); mara wants \(2, 6\)"),
-        (np.array([[0.1] * 6, [np.nan] + [0.1] * 5]), "the action holds NaN or infinity"),
-        (np.array([[0.1] * 6, [np.inf] + [0.1] * 5]), "the action holds NaN or infinity"),
+        (np.zeros((3, 6)), r"the action has shape \(3, 6\); mara needs \(2, 6\)"),
+        (np.zeros((2, 5)), r"the action has shape \(2, 5\); mara needs \(2, 6\)"),
+        (np.zeros(6), r"the action has shape \(6,\); mara needs \(2, 6\)"),
+        (np.array([[0.1] * 6, [np.nan] + [0.1] * 5]), "the action contains NaN or infinity"),
+        (np.array([[0.1] * 6, [np.inf] + [0.1] * 5]), "the action contains NaN or infinity"),
     ],
 )
-def test_wrong_actions_move_no_arm(actions: Floats, message: str) -> None:
+def test_invalid_actions_move_no_arm(actions: Floats, message: str) -> None:
     env = MaraVectorEnv(2, max_joint_velocity=1.0)
     env.reset()
     env.step(np.full((2, 6), 0.1))
@@ -354,7 +356,7 @@ def test_wrong_actions_move_no_arm(actions: Floats, message: str) -> None:
     assert str(env.save_state()["backend"]) == before
 
 
-def test_one_arm_that_collides_leaves_the_others_alone() -> None:
+def test_a_collision_of_one_arm_does_not_affect_the_others() -> None:
     env = MaraVectorEnv(3, "MARACollision-v0")
     env.reset()
     actions = np.array([COLLIDING_Q, [0.2] * 6, COLLIDING_Q])

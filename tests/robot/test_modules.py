@@ -105,9 +105,9 @@ def _distance(robot: RobotModel, data: pin.GeometryData, a: int, b: int) -> floa
     ("modules", "reason"),
     [
         (["base", "motor_big", "tool"], "Did you mean 'motor_"),
-        (["motor_large", "tool"], "begins with its one 'base'"),
-        ([], "begins with its one 'base'"),
-        (["base", "motor_large", "tool"], "'tool' does not fit onto 'motor_large'.*along x fit"),
+        (["motor_large", "tool"], "must begin with its only 'base'"),
+        ([], "must begin with its only 'base'"),
+        (["base", "motor_large", "tool"], "'tool' does not fit onto 'motor_large'.*along x: "),
         (["base", "tool"], "3 to 7 joints.*makes 0"),
         (["base", *["motor_small"] * 8, "tool"], "3 to 7 joints.*makes 9"),
     ],

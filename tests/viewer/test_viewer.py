@@ -98,7 +98,7 @@ def test_pause_step_and_play(page: Page, loop: Loop) -> None:
     assert loop.steps == paused_at
     for count in (1, 2):
         page.get_by_role("button", name="Step").click()
-        wait_until(lambda count=count: loop.steps >= paused_at + count, "the viewer takes one step")  # type: ignore[misc]
+        wait_until(lambda count=count: loop.steps >= paused_at + count, "one step")  # type: ignore[misc]
         time.sleep(0.3)
         assert loop.steps == paused_at + count
     page.get_by_role("button", name="Play").click()

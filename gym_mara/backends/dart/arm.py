@@ -1,4 +1,4 @@
-"""One arm in a DART world of its own: built from a RobotModel, moved by velocity servos, and what it touches."""
+"""One arm in its own DART world: built from a RobotModel, moved by velocity servos, with its contacts."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
+from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -30,8 +31,8 @@ DETECTORS = {
     "ode": "OdeCollisionDetector",
 }
 LOOK_AHEAD = 0.01
-"""For how long ahead contacts are ruled out at a time, s."""
-# DART wants a mass for every body, also for links that are welded to one that has the mass of both, kg and kg·m².
+"""The duration of a block of physics steps for which contacts are ruled out at once, s."""
+# DART wants a mass for every body, also for a link welded to a body that already has the mass of both; kg and kg·m².
 _NO_MASS = 1e-9
 
 
@@ -43,11 +44,11 @@ class DartArm:
         physics_step: s.
         detector: the collision detector, one of DETECTORS; None for a world without collisions.
         velocity_limit: of the joints (J,), rad/s; None for the robot's.
-        like: another arm made alike, to share with it what has no state.
-        servo: whether motors hold the joints; without them the arm falls.
+        like: an arm of the same robot and settings, with which it shares what has no state.
+        servo: whether motors move the joints; without them the arm falls.
 
     Raises:
-        GymMaraError: there is no such detector, or it does not know a shape of the robot.
+        GymMaraError: the detector is unknown, or DART does not know a shape of the robot.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class DartArm:
         self.world = _world(physics_step, detector or "fcl")
         self.world.addSkeleton(self.skeleton)
         self._forbid_contacts()
-        # The same arm in a world that does not look for contacts, which is most of what a step costs.
+        # The same arm in a world without collision detection, which is most of what a step costs.
         self._free_world = _world(physics_step, detector or "fcl")
         self._free_world.addSkeleton(self.skeleton)
         for world in (self.world, self._free_world):
@@ -112,20 +113,20 @@ class DartArm:
         return bodies
 
     def _build_shapes(self) -> None:
-        """The shapes of every link, on a body that bears the link's name."""
+        """The shapes of each link, on a body with the name of the link."""
         links: dict[str, Any] = {}
         unnamed = dict(enumerate(self.bodies))
         for index, geometry_object in enumerate(self.robot.geometry.geometryObjects):
             link, number = self.robot.link_of(index), geometry_object.parentJoint
             if link not in links:
-                # The first link on a joint is its body; others are welded to it, to tell their contacts apart.
+                # The first link of a joint is the joint's body; others are welded to it, so that contacts name the link.
                 body = unnamed.pop(number, None)
                 if body is None:
                     body = self.bodies[number].createWeldJointAndBodyNodePair()[1]
                     _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
                 body.setName(link)
                 links[link] = body
-            node = links[link].createShapeNode(_shape(geometry_object))
+            node = links[link].createShapeNode(_shape(self.robot, index))
             node.createCollisionAspect()
             node.createDynamicsAspect()
             node.setRelativeTransform(_isometry(geometry_object.placement))
@@ -133,7 +134,7 @@ class DartArm:
         self.skeleton.enableAdjacentBodyCheck()
 
     def _forbid_contacts(self) -> None:
-        """Ignore the pairs of links that the robot says may not collide."""
+        """Exclude the pairs of links that may not collide."""
         self._option = self.world.getConstraintSolver().getCollisionOption()
         named = [b for b in self.skeleton.getBodyNodes() if b.getNumShapeNodes()]
         for index, one in enumerate(named):
@@ -149,11 +150,11 @@ class DartArm:
         joint_friction: Floats | float | None = None,
         contact_friction: float = 1.0,
     ) -> None:
-        """Make this arm differ from its model.
+        """Set the physical parameters in which this arm differs from its model.
 
         Args:
-            mass: scale of the mass and inertia that each joint carries (J,).
-            effort_limit: scale of each motor's limit (J,).
+            mass: scale of the mass and inertia of each joint's body (J,).
+            effort_limit: scale of each motor's effort limit (J,).
             joint_friction: Coulomb friction of each joint (J,), Nm; None for the URDF's.
             contact_friction: coefficient of friction of all surfaces.
         """
@@ -227,14 +228,14 @@ class DartArm:
         return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
 
     def may_touch(self) -> bool:
-        """Whether anything could touch within a block of steps from now."""
+        """Whether any links could touch within the next block of steps."""
         q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
         slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
         return bool(not slow or self._clearance.check(q[None])[0])
 
     def _run_with_contacts(self, velocities: Floats, deepest: dict[tuple[str, str], float]) -> None:
-        # Detectors remember where shapes have been, and report contacts in an order that hangs on it, with which the
-        # solver's last bits change. Afresh, what follows hangs on the arm's state alone, and can be repeated from it.
+        # A detector keeps data from earlier steps. The order in which it reports contacts depends on them, and so do the
+        # last bits of the solver's result. With a fresh detector the motion depends on the arm's state alone.
         group = self.world.getConstraintSolver().getCollisionGroup()
         group.removeAllShapeFrames()
         group.addShapeFramesOf(self.skeleton)
@@ -245,10 +246,10 @@ class DartArm:
             step()
             found = result()
             if found.isCollision():
-                _note(found, deepest)
-        # A step looks for contacts before it moves: those of the last one are still unseen.
+                _note_contacts(found, deepest)
+        # A step detects contacts before it moves, so those at the end of the last step are still unknown.
         if self.world.checkCollision(self._option, found := dart.collision.CollisionResult()):
-            _note(found, deepest)
+            _note_contacts(found, deepest)
 
 
 def _world(physics_step: float, detector: str) -> Any:
@@ -259,15 +260,15 @@ def _world(physics_step: float, detector: str) -> Any:
     world.setTimeStep(physics_step)
     world.setGravity([0.0, 0.0, -GRAVITY])
     world.setCollisionDetector(getattr(dart.collision, DETECTORS[detector])())
-    # An arm at rest must not be put to sleep: it would no longer feel small commands.
+    # DART must not deactivate an arm at rest: it would no longer follow small commands.
     deactivation = world.getDeactivationOptions()
     deactivation.mEnabled = False
     world.setDeactivationOptions(deactivation)
     return world
 
 
-def _note(result: Any, deepest: dict[tuple[str, str], float]) -> None:
-    """Enter the contacts of a result, each pair of links at its deepest."""
+def _note_contacts(result: Any, deepest: dict[tuple[str, str], float]) -> None:
+    """Enter the contacts of a result, for each pair of links the deepest."""
     for contact in result.getContacts():
         ends = (contact.collisionObject1, contact.collisionObject2)
         one, other = sorted(e.getShapeFrame().asShapeNode().getBodyNode().getName() for e in ends)
@@ -283,27 +284,26 @@ def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
     body.setInertia(dart.dynamics.Inertia(inertia.mass, inertia.lever, inertia.inertia))
 
 
-def _shape(geometry_object: pin.GeometryObject) -> Any:
-    """DART's shape of one of Pinocchio's geometry objects."""
-    shape = geometry_object.geometry
-    kind = type(shape).__name__
-    if kind == "Box":
-        return dart.dynamics.BoxShape(2.0 * shape.halfSide)
-    if kind == "Cylinder":
-        return dart.dynamics.CylinderShape(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Capsule":
-        return dart.dynamics.CapsuleShape(shape.radius, 2.0 * shape.halfLength)
-    if kind == "Sphere":
-        return dart.dynamics.SphereShape(shape.radius)
-    if kind.startswith("BVHModel"):
-        return _mesh(geometry_object.meshPath, geometry_object.meshScale)
+def _shape(robot: RobotModel, index: int) -> Any:
+    """DART's shape of one of the robot's collision shapes."""
+    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
+        case Box(size):
+            return dart.dynamics.BoxShape(size)
+        case Sphere(radius):
+            return dart.dynamics.SphereShape(radius)
+        case Cylinder(radius, length):
+            return dart.dynamics.CylinderShape(radius, length)
+        case Capsule(radius, length):
+            return dart.dynamics.CapsuleShape(radius, length)
+        case Mesh(path, scale, convex=False):
+            return _mesh(path, scale)
     raise GymMaraError(
-        f"the backend 'dart' does not know the shape {kind} of {geometry_object.name!r}"
+        f"the backend 'dart' does not support the convex hull of link {robot.link_of(index)!r}"
     )
 
 
 def _mesh(path: str, scale: Floats) -> Any:
-    """A mesh from a file; DART reads one only as a part of a URDF."""
+    """A mesh from a file; DART reads meshes only as parts of a URDF."""
     sizes = " ".join(repr(float(value)) for value in scale)
     urdf = (
         f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(path)} '

@@ -15,7 +15,8 @@ from gym_mara.agents.runs.evaluation import evaluate_run, make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.callbacks import OnProgress
 from gym_mara.agents.training.train import resume, train
-from gym_mara.backends.workers import WorkerBackend, WorkerDiedError
+from gym_mara.backends.processes import WorkerDiedError
+from gym_mara.backends.workers import WorkerBackend
 from gym_mara.errors import GymMaraError
 from tests.agents.conftest import config, silent
 from tests.agents.training.test_train import assert_same_training
