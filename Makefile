@@ -7,14 +7,17 @@ READY = $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test lint bench experiment test-oldest test-rllib test-wheel clean
+.PHONY: demo test test-slow lint bench experiment test-oldest test-rllib test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
 
-test: $(READY) ## Run the tests, some of them in Chromium.
+test: $(READY) ## Run the tests, but for the slow ones.
+	$(BIN)/python -m pytest -n auto -m "not slow" $(TESTS)
+
+test-slow: $(READY) ## Run the slow tests: long trainings, Chromium, the examples.
 	.ci/chromium
-	$(BIN)/python -m pytest -n auto $(TESTS)
+	$(BIN)/python -m pytest -n auto -m slow
 
 lint: $(READY) ## Check format, lint and types.
 	$(BIN)/ruff format --check .

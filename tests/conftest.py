@@ -35,6 +35,13 @@ settings.register_profile("gym_mara", deadline=None, max_examples=40, derandomiz
 settings.load_profile("gym_mara")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that open Chromium as slow."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(autouse=True)
 def _no_process_is_left_behind() -> Iterator[None]:
     """Fail a test that leaves child processes behind, and kill them."""

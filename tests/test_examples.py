@@ -12,6 +12,8 @@ import yaml
 
 from tests.helpers import ENV_IDS
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CALLS = {
     "sb3_ppo.py --way single": "position error",

@@ -102,8 +102,9 @@ class Sensors:
 
     def _positions(self, q: Floats, noise: Floats, arms: Mask) -> Floats:
         measured = q.copy()
-        for arm in np.flatnonzero(arms).tolist():
-            measured[arm] += noise[arm] * self._generators[arm].standard_normal(q.shape[1])
+        for arm, generator in self._generators.items():  # the others have not begun an episode yet
+            if arms[arm]:
+                measured[arm] += noise[arm] * generator.standard_normal(q.shape[1])
         return measured.clip(self._robot.lower, self._robot.upper)
 
     def save(self) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def test_an_unknown_backend_is_named_with_the_nearest_and_the_known_ones() -> No
 def test_an_unknown_setting_is_named_with_the_known_ones(mara: RobotModel) -> None:
     with pytest.raises(
         GymMaraError,
-        match=r"unknown setting 'wall' of the backend 'pinocchio'.*collision, .*control_period.*"
+        match=r"unknown keyword argument 'wall' with backend 'pinocchio'.*collision, .*control_period.*"
         r"max_joint_velocity, path_resolution",
     ):
         make_backend("pinocchio", mara, 1, {"wall": 1.0})

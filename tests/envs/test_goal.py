@@ -138,6 +138,7 @@ def test_reaching_the_goal_is_a_success() -> None:
     assert not info["is_success"]
 
 
+@pytest.mark.slow
 def test_hindsight_replay_relabels_goals_as_successes() -> None:
     env = gymnasium.wrappers.RescaleAction(
         gymnasium.make("gym_mara/MARAGoal-v0", max_episode_steps=10),

@@ -41,6 +41,7 @@ class LogCallback(BaseCallback):
         return [values[name] for values in self.rows if name in values]
 
 
+@pytest.mark.slow
 def test_it_learns_a_task_with_discrete_actions() -> None:
     env = make_vec_env("CartPole-v1", n_envs=8, seed=0)
     model = ACKTR("MlpPolicy", env, n_steps=32, seed=0, device="cpu")
@@ -49,6 +50,7 @@ def test_it_learns_a_task_with_discrete_actions() -> None:
     assert np.mean(rewards) > 100.0, "untrained it is about 20"
 
 
+@pytest.mark.slow
 def test_it_learns_to_reach() -> None:
     env = make_env("MARA-v0", "pinocchio", 64, {})
     model = ACKTR(

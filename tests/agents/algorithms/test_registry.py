@@ -126,6 +126,7 @@ def config(**changes: Any) -> RunConfig:
     return RunConfig(**{**values, **changes})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("a2c")
 def test_a_registered_algorithm_trains_and_is_evaluated(tmp_path: Path) -> None:
     run = train(config(), tmp_path / "run", silent)
@@ -137,6 +138,7 @@ def test_a_registered_algorithm_trains_and_is_evaluated(tmp_path: Path) -> None:
     assert run.config.preset["arguments"]["n_steps"] == 8
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("a2c")
 def test_a_registered_algorithm_has_its_place_in_a_grid(tmp_path: Path) -> None:
     grid = Grid(envs=("MARA-v0",), algos=("a2c",), seeds=1, steps=256, checkpoint_every=128)
@@ -147,6 +149,7 @@ def test_a_registered_algorithm_has_its_place_in_a_grid(tmp_path: Path) -> None:
     assert "| MARA-v0 | A2C | 1 |" in (tmp_path / "grid" / "table.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("a2c")
 def test_a_registered_algorithm_is_searched(tmp_path: Path) -> None:
     search = Search(env="MARA-v0", algo="a2c", steps=128, trials=2, seeds=1)

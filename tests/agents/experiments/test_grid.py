@@ -31,6 +31,8 @@ from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
 from tests.helpers import started
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
 
 

@@ -23,6 +23,8 @@ from gym_mara.backends.workers import choose_workers
 from gym_mara.cli.experiments import _executor
 from gym_mara.errors import GymMaraError
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=8192, checkpoint_every=2048)
 
 

@@ -42,6 +42,7 @@ def differing(one: Any, other: Any) -> float:
     return float((np.abs(one.astype(int) - other.astype(int)).max(axis=-1) > 40).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_film_shows_the_start_of_an_episode(
     finished_run: RunFolder, tmp_path: Path, suffix: str
@@ -71,6 +72,7 @@ def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path:
     assert differing(arrived, travelling) > 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "rate"), [(0.3, 15.0), (1.0, 50.0), (3.0, 50.0)])
 def test_the_speed_of_a_film(
     finished_run: RunFolder, tmp_path: Path, speed: float, rate: float
@@ -121,6 +123,7 @@ def test_a_film_with_an_odd_size_is_cropped(tmp_path: Path) -> None:
     assert pictures(film).shape == (3, 100, 160, 3)
 
 
+@pytest.mark.slow
 def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Path) -> None:
     file = write_report(finished_run, tmp_path / "report.html")
     requests, errors = [], []
@@ -169,6 +172,7 @@ def test_a_report_does_not_overwrite_another_file(finished_run: RunFolder, tmp_p
         write_report(finished_run, tmp_path / "missing" / "report.html")
 
 
+@pytest.mark.slow
 def test_a_report_names_a_backend_that_is_not_installed(
     finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +184,7 @@ def test_a_report_names_a_backend_that_is_not_installed(
     assert "No installed backend simulates torques" in text
 
 
+@pytest.mark.slow
 def test_a_report_escapes_the_texts_of_a_run(finished_run: RunFolder, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished_run.path, run)
@@ -201,6 +206,7 @@ def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatc
         import gym_mara.agents.inspection.report  # noqa: F401
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_run", [True, False], ids=["run", "jog"])
 def test_watch_serves_the_viewer_until_an_interrupt(
     finished_run: RunFolder, with_run: bool

@@ -21,6 +21,8 @@ from gym_mara.errors import GymMaraError
 from tests.agents.conftest import config, silent
 from tests.agents.training.test_train import assert_same_training
 
+pytestmark = pytest.mark.slow
+
 ROLLOUT = 16 * 32
 SMALL = Preset(num_envs=16, policy="natural", arguments={"n_steps": 32, "batch_size": 128})
 

@@ -69,6 +69,7 @@ def test_a_run_writes_all_its_files(finished_run: RunFolder) -> None:
     assert {r["time/total_timesteps"] for r in rows} == {ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT}
 
 
+@pytest.mark.slow
 def test_the_same_seed_trains_the_same_policy(finished_run: RunFolder, tmp_path: Path) -> None:
     again = train(config(), tmp_path / "run", silent)
     assert_same_training(finished_run, again)
@@ -80,6 +81,7 @@ def test_another_seed_trains_another_policy(finished_run: RunFolder, tmp_path: P
     assert not all(torch.equal(mine[name], theirs[name]) for name in mine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("updates_before_the_interrupt", [1, 2])
 def test_an_interrupted_run_is_resumed_with_the_same_result(
     finished_run: RunFolder, tmp_path: Path, updates_before_the_interrupt: int
@@ -95,6 +97,7 @@ def test_an_interrupted_run_is_resumed_with_the_same_result(
     assert_same_training(finished_run, resumed)
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_resumed_from_its_last_checkpoint(tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = ["-m", "gym_mara.cli", "train", "--out", str(run), "--steps", "1e7"]
@@ -113,6 +116,7 @@ def test_a_killed_run_is_resumed_from_its_last_checkpoint(tmp_path: Path) -> Non
     assert resumed.has_policy("last")
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_before_its_first_checkpoint_starts_again(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
@@ -136,6 +140,7 @@ def test_a_run_interrupted_after_its_last_checkpoint_is_finished(
     assert (resumed.path / "learning_curve.png").is_file()
 
 
+@pytest.mark.slow
 def test_the_learning_curve_is_drawn_before_a_run_counts_as_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +206,7 @@ def test_an_evaluation_has_each_metric_of_each_episode(finished_run: RunFolder) 
     assert summary["return"].keys() == {"mean", "std", "min", "max"}
 
 
+@pytest.mark.slow
 def test_an_evaluation_uses_the_environment_of_the_training(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
@@ -376,6 +382,7 @@ def test_only_one_process_at_a_time_trains_a_run(
     assert resume(run.path, silent).has_policy("last")
 
 
+@pytest.mark.slow
 def test_a_run_in_training_is_not_resumed(tmp_path: Path) -> None:
     refused: list[int] = []
 
