@@ -1,8 +1,7 @@
 """Environment steps per second, compared with Pinocchio alone and with other packages; prints Markdown.
 
-The floor is the work that any environment on Pinocchio must do: forward kinematics, without and with Coal's batched
-collision check, for the same configurations that the environment visits. Every figure is the best of several repetitions.
-Figures that are compared are measured in turn, because on a shared machine only ratios within one run are meaningful.
+The floor is what Pinocchio alone takes for the configurations that the environment visits: Coal's batched collision check on all
+cores, and forward kinematics. Every figure is the best of several repetitions. Figures that are compared are measured in turn, because on a shared machine only ratios within one run are meaningful.
 """
 
 from __future__ import annotations

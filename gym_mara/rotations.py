@@ -94,7 +94,7 @@ def from_matrix(rotation: Floats) -> Floats:
     largest component is the best conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
     """
     rows = np.arange(len(rotation))
-    outer = rotation.reshape(-1, 1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
-    largest = outer[:, 0, ::5].argmax(axis=-1)  # on the diagonal of 4 q qᵀ
+    outer = rotation.reshape(-1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
+    largest = outer[:, ::5].argmax(axis=-1)  # on the diagonal of 4 q qᵀ
     row = outer.reshape(-1, 4, 4)[rows, largest]
     return canonical(row / (2.0 * np.sqrt(row[rows, largest]))[:, None])

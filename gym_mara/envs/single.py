@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.streams import Streams
@@ -53,7 +54,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         *,
         robot: RobotLike = "mara",
         ee_frame: str | None = None,
-        backend: str = "pinocchio",
+        backend: str = DEFAULT_BACKEND,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.single import checked_render_mode
@@ -48,7 +49,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         *,
         robot: RobotLike = "mara",
         ee_frame: str | None = None,
-        backend: str = "pinocchio",
+        backend: str = DEFAULT_BACKEND,
         render_mode: str | None = None,
         max_episode_steps: int | None = MAX_EPISODE_STEPS,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,

@@ -8,6 +8,7 @@ for MARA's pose on one core: one configuration takes Pinocchio 5 µs; 256 take i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ class Kinematics:
             else:
                 terms[1, :3, :3], terms[2, :3, :3] = np.eye(3) - along, pin.skew(axis)
         placements = np.array([p.homogeneous for p in model.jointPlacements[1:]])
-        self._terms = (placements[:, None] @ local).reshape(len(motions), 1, 3, 16)
+        self._terms = (placements[:, None] @ local).reshape(len(motions), 3, 16)
         self._buffers: dict[int, tuple[Floats, Floats]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -93,6 +94,26 @@ class Kinematics:
         columns = np.where(self.prismatic[:, None, None], axes, turning)
         return (columns * qd.T[:, :, None]).sum(axis=0)
 
+    def points(self, q: Floats, bodies: Sequence[int], points: Floats) -> Floats:
+        """The positions in the world (P, N, 3), m, of points that are fixed to bodies of the arm, at q (N, J).
+
+        Args:
+            q: the configurations.
+            bodies: for each point the number of the joint that moves its body, from 0; in descending order.
+            points: in the bodies' frames (P, 3), m.
+        """
+        local = self._local_transforms(q)
+        homogeneous = np.ones((len(points), 4, 1))
+        homogeneous[:, :3, 0] = points
+        placed = np.empty((len(q), 4, 0))
+        for joint in range(bodies[0], -1, -1):
+            columns = [homogeneous[i] for i, body in enumerate(bodies) if body == joint]
+            if columns:
+                new = np.broadcast_to(np.hstack(columns), (len(q), 4, len(columns)))
+                placed = np.concatenate([placed, new], axis=2)
+            placed = local[joint] @ placed
+        return placed[:, :3].transpose(2, 0, 1)
+
     def _velocity_of_one(self, q: Floats, qd: Floats) -> Floats:
         pin.forwardKinematics(self._model, self._data, q, qd)
         pin.updateFramePlacement(self._model, self._data, self._frame)
@@ -109,14 +130,14 @@ class Kinematics:
         if count not in self._buffers:
             if len(self._buffers) > 8:
                 self._buffers.clear()
-            flat = np.empty((joints, count, 1, 16))
-            self._buffers[count] = np.ones((joints, count, 1, 3)), flat
+            flat = np.empty((joints, count, 16))
+            self._buffers[count] = np.ones((joints, count, 3)), flat
         coefficients, flat = self._buffers[count]
-        np.cos(q.T, out=coefficients[:, :, 0, 1])
-        np.sin(q.T, out=coefficients[:, :, 0, 2])
+        np.cos(q.T, out=coefficients[:, :, 1])
+        np.sin(q.T, out=coefficients[:, :, 2])
         if self._any_prismatic:
-            coefficients[self.prismatic, :, 0, 1] = q.T[self.prismatic]
-            coefficients[self.prismatic, :, 0, 2] = 0.0
+            coefficients[self.prismatic, :, 1] = q.T[self.prismatic]
+            coefficients[self.prismatic, :, 2] = 0.0
         np.matmul(coefficients, self._terms, out=flat)
         return flat.reshape(joints, count, 4, 4)
 

@@ -130,3 +130,23 @@ def test_a_copy_computes_the_same(
     other = duplicate(kinematics)
     q = uniform_q(mara, 3, 9)
     np.testing.assert_array_equal(other.pose(q)[0], kinematics.pose(q)[0])
+
+
+@pytest.mark.parametrize("name", ["mara", "panda", "rail"])
+def test_points_are_where_pinocchio_places_them(name: str, tmp_path: Path) -> None:
+    if name == "rail":
+        joints = joint_xml(0, kind="prismatic"), *(joint_xml(number) for number in range(1, 4))
+        robot = RobotModel.load(write(tmp_path / "rail.urdf", urdf_xml(*joints)), "link4")
+    else:
+        robot = robot_model(name)
+    rng = np.random.default_rng(0)
+    q = uniform_q(robot, 40, seed=0)
+    bodies = sorted(rng.integers(robot.num_joints, size=6).tolist(), reverse=True)
+    points = rng.normal(size=(6, 3))
+    placed = robot.kinematics().points(q, bodies, points)
+    assert placed.shape == (6, 40, 3)
+    data = robot.model.createData()
+    for row, configuration in enumerate(q):
+        pin.forwardKinematics(robot.model, data, configuration)
+        expected = [data.oMi[b + 1].act(p) for b, p in zip(bodies, points, strict=True)]
+        np.testing.assert_allclose(placed[:, row], expected, rtol=0.0, atol=1e-12)
