@@ -18,7 +18,7 @@ class Contact(NamedTuple):
     """The deepest penetration during the last control period, m."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, init=False)
 class SimState:
     """The state of N arms at one instant. All arrays are fresh: a backend never changes them later.
 
@@ -48,3 +48,32 @@ class SimState:
     None if the state cannot diverge."""
     parameters: Mapping[str, Floats] | None = None
     """The random parameters of each arm's episode by name, each (N, …); None without randomisation."""
+
+    def __init__(
+        self,
+        q: Floats,
+        qd: Floats,
+        ee_position: Floats,
+        ee_quaternion: Floats,
+        ee_velocity: Floats,
+        collided: Mask,
+        time: Floats,
+        torque: Floats | None = None,
+        contacts: tuple[tuple[Contact, ...], ...] | None = None,
+        diverged: Mask | None = None,
+        parameters: Mapping[str, Floats] | None = None,
+    ) -> None:
+        # The constructor that a frozen dataclass generates takes almost twice as long, and every step makes a state.
+        vars(self).update(
+            q=q,
+            qd=qd,
+            ee_position=ee_position,
+            ee_quaternion=ee_quaternion,
+            ee_velocity=ee_velocity,
+            collided=collided,
+            time=time,
+            torque=torque,
+            contacts=contacts,
+            diverged=diverged,
+            parameters=parameters,
+        )

@@ -120,7 +120,7 @@ class Simulation:
         if noise is not None:
             self._sensors.begin_episodes(self.streams, chosen)
             self._sensors.begin(self._start, noise, chosen)
-        return self._observe(state), _report(state)
+        return self._observe(state, noise), _report(state)
 
     def step(self, action: ArrayLike) -> Outcome:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
@@ -138,7 +138,7 @@ class Simulation:
         noise = _sensor_noise(state)
         if noise is not None:
             self._sensors.measure(state.q, noise)
-        observation = self._observe(state)
+        observation = self._observe(state, noise)
         reward, terms = self.task.reward(state, self.goal)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
@@ -211,9 +211,9 @@ class Simulation:
             self._options.sensors,
         )
 
-    def _observe(self, state: SimState) -> Floats:
-        """The observations (N, O) of a state, from the noisy measurements if there is sensor noise."""
-        if _sensor_noise(state) is not None:
+    def _observe(self, state: SimState, noise: Floats | None) -> Floats:
+        """The observations (N, O) of a state; if there is noise, of what the sensors have measured."""
+        if noise is not None:
             state = self._sensors.seen(state)
         return self.observation(state, self.goal)
 
@@ -232,7 +232,8 @@ class Simulation:
             raise GymMaraError(
                 "the action contains NaN or infinity; joint targets must be finite (rad)"
             )
-        return target.clip(self.target_low, self.target_high)
+        # In half the time of target.clip for one arm.
+        return np.minimum(np.maximum(target, self.target_low), self.target_high)
 
     def _check_open(self) -> None:
         if self._closed:

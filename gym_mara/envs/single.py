@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import view_of
 from gym_mara.errors import unknown
@@ -88,16 +88,15 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         Raises:
             GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
         """
-        outcome = self._advance(np.asarray(action)[None])
+        targets = np.asarray(action)[None]
+        # The viewer steps the simulation in real time, and may replace the targets.
+        step = self.simulation.step if self.viewer is None else self.viewer.step
+        outcome = step(targets)
         info = _info_of_one(outcome.info)
         # At every step, because an environment does not know when Gymnasium's TimeLimit truncates its episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
         return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
-
-    def _advance(self, targets: NDArray[Any]) -> Outcome:
-        """Step the simulation. With a viewer, the viewer steps it in real time, and may replace the targets."""
-        return self.simulation.step(targets) if self.viewer is None else self.viewer.step(targets)
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """Draw the state of the last observation: uint8 (height, width, 3), RGB; None without render_mode "rgb_array".

@@ -33,6 +33,7 @@ class EpisodeStatistics:
         self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:8]
         # The distance, the reward, the count 1 and the collision of one step.
         self._step = np.ones((4, num_envs))
+        self._extremes = self._step[:2]
         self.clear(slice(None))
 
     @property
@@ -43,8 +44,8 @@ class EpisodeStatistics:
     def add(self, distance: Floats, reward: Floats, collided: NDArray[np.bool_]) -> None:
         """Add one step of every episode. All arrays are (N,); the distance is in m."""
         self._step[0], self._step[1], self._step[3] = distance, reward, collided
-        np.maximum(self._max, self._step[:2], out=self._max)
-        np.minimum(self._min, self._step[:2], out=self._min)
+        np.maximum(self._max, self._extremes, out=self._max)
+        np.minimum(self._min, self._extremes, out=self._min)
         self._sum += self._step
 
     def clear(self, chosen: NDArray[np.bool_] | slice) -> None:

@@ -55,6 +55,7 @@ class Observation:
                     f"not {np.shape(part.low)} and {np.shape(part.high)}"
                 )
         self.parts = tuple(parts)
+        self._values = [part.values for part in parts]
         low, high = (
             np.concatenate([part.low for part in parts]),
             np.concatenate([part.high for part in parts]),
@@ -65,7 +66,7 @@ class Observation:
 
     def __call__(self, state: SimState, goal: Goal) -> Floats:
         """Compute the flat observations (N, O) of N arms, a fresh array."""
-        return np.concatenate([part.values(state, goal) for part in self.parts], axis=-1)
+        return np.concatenate([values(state, goal) for values in self._values], axis=-1)
 
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""

@@ -57,10 +57,12 @@ def _orientation_constants(beta: float, gamma: float) -> tuple[Floats, Floats]:
 
 def collision_penalty(collided: Mask, distance: Floats, delta: float, eta: float) -> Floats:
     """The collision penalty: δ (2 min(d, 0.5))^η at a distance d (...,), m, if the arm collided, else 0."""
-    if not np.count_nonzero(collided):
+    count = np.count_nonzero(collided)
+    if not count:
         return np.zeros(np.shape(distance))
     size, exponent = _penalty_constants(delta, eta)
-    return collided * (size * np.minimum(_TWO * distance, _ONE) ** exponent)
+    penalty = size * np.minimum(_TWO * distance, _ONE) ** exponent
+    return penalty if count == collided.size else collided * penalty
 
 
 @lru_cache(maxsize=64)
