@@ -1,4 +1,8 @@
-"""The renderer "raycast": ray casting on the CPU with Embree, for machines without OpenGL."""
+"""The renderer "raycast": ray casting on the CPU with Embree, for machines without OpenGL.
+
+trimesh also casts rays with Embree, but does not return where in a triangle a ray hits, which smooth shading needs. Through its
+interface the first hits of a picture took 200 ms with their positions, through Embree's own 18 ms.
+"""
 
 from __future__ import annotations
 
