@@ -139,7 +139,7 @@ class MujocoBackend(ServoBackend):
         return super().save() | {"states": states}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Return to a snapshot; MuJoCo computes anew what follows from a state."""
+        """Return to a snapshot; MuJoCo computes again what follows from a state."""
         super().restore(snapshot)
         for arm, state in zip(self._arms, snapshot["states"], strict=True):
             mujoco.mj_setState(self._model, arm, state, _STATE)

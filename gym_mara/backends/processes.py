@@ -81,7 +81,7 @@ class Workers:
                 "the worker processes belong to the process that this one was forked from; make the environment here"
             )
         if not self._end.alive:
-            raise WorkerDiedError("the worker processes have ended; make the environment anew")
+            raise WorkerDiedError("the worker processes have ended; make a new environment")
         with self._killed_on_failure():
             for pipe, its_arguments in zip(self._pipes, arguments, strict=True):
                 pipe.send((name, its_arguments))
@@ -107,7 +107,7 @@ class Workers:
             self.close()
             if isinstance(error, (EOFError, OSError)):
                 raise WorkerDiedError(
-                    "a worker process of the simulation died (killed, or out of memory?); make the environment anew, "
+                    "a worker process of the simulation died (killed, or out of memory?); make a new environment, "
                     "with fewer arms or workers if memory was short"
                 ) from error
             raise

@@ -1,4 +1,4 @@
-"""Domain randomisation: ranges of physical parameters, from which each arm draws anew for every episode."""
+"""Domain randomisation: ranges of physical parameters, from which each arm draws new values for every episode."""
 
 from __future__ import annotations
 

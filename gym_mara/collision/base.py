@@ -33,7 +33,7 @@ class CollisionChecker(ABC):
         return None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # The engines' objects do not pickle; a copy is built anew from the robot.
+        # The engines' objects do not pickle; a copy is built from the robot.
         return type(self), (self.robot,)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CollisionChecker:

@@ -256,7 +256,7 @@ class RobotModel:
         array = np.array(q, dtype=np.float64)
         if array.shape != (self.num_joints,):
             raise GymMaraError(
-                f"{what} has shape {array.shape}; {self.name} wants {(self.num_joints,)}"
+                f"{what} has shape {array.shape}; {self.name} needs {(self.num_joints,)}"
             )
         beyond = ~((array >= self.lower) & (array <= self.upper))
         if beyond.any():

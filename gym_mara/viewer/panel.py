@@ -1,4 +1,4 @@
-"""The viewer's panel: buttons, sliders and plots beside the scene."""
+"""The viewer's panel: buttons, sliders and plots next to the scene."""
 
 from __future__ import annotations
 

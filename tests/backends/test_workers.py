@@ -230,7 +230,7 @@ def test_a_worker_that_dies_is_an_error_and_all_end(number: signal.Signals) -> N
     with pytest.raises(WorkerDiedError, match="a worker process of the simulation died"):
         backend.step(STILL)
     assert not any(process.is_alive() for process in backend.processes)
-    with pytest.raises(WorkerDiedError, match="have ended; make the environment anew"):
+    with pytest.raises(WorkerDiedError, match="have ended; make a new environment"):
         backend.step(STILL)
     backend.close()
 

@@ -166,7 +166,7 @@ def test_reach_of_a_sliding_joint_is_its_own_travel(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("q", "message"),
     [
-        ([0.0] * 5, r"start_q has shape \(5,\); mara wants \(6,\)"),
+        ([0.0] * 5, r"start_q has shape \(5,\); mara needs \(6,\)"),
         (
             [0, 2.36, 0, 0, 0, 0],
             r"joint motor2 cannot be at 2\.36; its limits are \[-2\.35, 2\.35\]",

@@ -114,7 +114,7 @@ def run_search(
 
 
 def run_trials(search: Search, folder: Path, send: Send) -> None:
-    """Run trials until the search has as many finished ones as it wants; several processes may do so."""
+    """Run trials until the search has enough finished ones; several processes may do so."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = open_study(search, folder)
     while finished_trials(study) < search.trials:

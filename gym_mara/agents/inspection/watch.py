@@ -1,4 +1,4 @@
-"""Shows a policy: in a film, one backend beside the other, or live in the viewer."""
+"""Shows a policy: in a film, backends side by side, or live in the viewer."""
 
 from __future__ import annotations
 

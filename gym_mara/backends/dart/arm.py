@@ -32,7 +32,7 @@ DETECTORS = {
 }
 LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
-# DART wants a mass for every body, also for a link welded to a body that already has the mass of both; kg and kg·m².
+# DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
 _NO_MASS = 1e-9
 
 
