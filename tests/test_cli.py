@@ -187,3 +187,16 @@ def test_training_without_torch_names_the_extra(tmp_path: Path) -> None:
         assert result.returncode == 2
         assert "gym_mara[train]" in result.stderr
         assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("setting", "instead"),
+    [("backend=dart", "give --backend"), ("num_envs=4", "the preset sets the number of arms")],
+)
+def test_what_a_command_sets_itself_is_no_keyword(
+    gym_mara: Cli, tmp_path: Path, setting: str, instead: str
+) -> None:
+    code, _, err = gym_mara("train", "--set", setting, "--out", str(tmp_path / "run"))
+    assert code == 2
+    assert instead in err
+    assert not (tmp_path / "run").exists()

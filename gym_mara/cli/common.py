@@ -70,11 +70,24 @@ def whole(option: str, value: float) -> int:
     return int(value)
 
 
+# Keyword arguments of the environments that the commands set themselves.
+_OPTIONS = {
+    "backend": "give --backend",
+    "task": "give --env",
+    "num_envs": "the preset sets the number of arms",
+    "max_episode_steps": "the commands play episodes of their own length",
+    "autoreset_mode": "the commands set it",
+    "render_mode": "see gym-mara watch",
+}
+
+
 def keyword_arguments(settings: list[str]) -> dict[str, Any]:
     """Keyword arguments from NAME=VALUE; a value that is not JSON is taken as a string."""
     options = {}
     for setting in settings:
         name, separator, value = setting.partition("=")
+        if name in _OPTIONS:
+            raise GymMaraError(f"--set {setting!r}: {name} is no such keyword; {_OPTIONS[name]}")
         if not separator or not name.isidentifier():
             raise GymMaraError(f"--set {setting!r}: write NAME=VALUE")
         try:

@@ -13,6 +13,9 @@ from gym_mara.rendering import RenderSettings
 from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import Task, named_task
 
+# Arguments of the environments that are not sorted, but valid as well.
+_OTHERS = ("backend", "ee_frame", "render_mode", "robot", "task")
+
 
 @dataclass(frozen=True)
 class Options:
@@ -60,7 +63,7 @@ class Options:
         for name, value in keywords.items():
             owners = [room for room, names in rooms.items() if name in names]
             if not owners:
-                valid = [name for names in rooms.values() for name in names]
+                valid = [*_OTHERS, *(name for names in rooms.values() for name in names)]
                 raise unknown("keyword argument", name, valid, f" with backend {backend!r}")
             if len(owners) > 1:
                 raise GymMaraError(

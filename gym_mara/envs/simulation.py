@@ -75,8 +75,8 @@ class Simulation:
         """The random generators of each arm; needed if `random` is true."""
         if options.sensors.velocity_filter and _sensor_noise(self.backend.state) is None:
             raise GymMaraError(
-                "velocity_filter smooths the velocity of noisy sensors: "
-                "also give randomisation={'sensor_noise': (lowest, highest)}, or leave it out"
+                "velocity_filter smooths the velocity of noisy sensors, and these are exact: on a backend that has "
+                "'randomisation' also give randomisation={'sensor_noise': (lowest, highest)}; else leave it out"
             )
         self._sensors = self._new_sensors()
         self.observation = Observation(
