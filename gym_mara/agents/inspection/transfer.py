@@ -11,7 +11,7 @@ from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.runs.evaluation import make_env, options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
-from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.errors import whole_number
 from gym_mara.types import Floats
 
 SETTLED = 0.005
@@ -48,14 +48,15 @@ def transfer(
         run: the run.
         episodes: how many on each backend; they differ only if the options make them random.
         which: the policy, "last" or "best".
-        options: settings of backends; each backend gets those that it knows.
+        options: keyword arguments of the environment, in addition to those of the run; each backend gets the settings
+            that it knows.
 
     Returns:
         A row for each backend. A backend whose joints teleport and that can limit their velocity has a second row, with the
         robot's lowest velocity limit for all joints.
 
     Raises:
-        GymMaraError: the policy is missing or damaged, or no installed backend knows an option.
+        GymMaraError: the policy is missing or damaged, or an option is unknown or out of its range.
     """
     whole_number("episodes", episodes)
     of_env, given = options_beyond_backend(run.config), options or {}
@@ -63,11 +64,8 @@ def transfer(
     for reason in reasons:
         warnings.warn(reason, stacklevel=2)
     settings = {name: backend_settings(name) for name in installed}
-    if lost := set(given).difference(*settings.values()):
-        raise GymMaraError(
-            f"no installed backend knows the setting {min(lost)!r}; "
-            f"known: {', '.join(sorted(set().union(*settings.values())))}"
-        )
+    of_backends = set().union(*settings.values())
+    of_env |= {key: value for key, value in given.items() if key not in of_backends}
     rows = []
     for name, known in settings.items():
         chosen = {key: value for key, value in given.items() if key in known}

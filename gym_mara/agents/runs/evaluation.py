@@ -40,7 +40,12 @@ def make_env(
 
 
 def evaluate_run(
-    run: RunFolder, *, backend: str | None = None, episodes: int = 10, which: str = "last"
+    run: RunFolder,
+    *,
+    backend: str | None = None,
+    episodes: int = 10,
+    which: str = "last",
+    options: dict[str, Any] | None = None,
 ) -> dict[str, Floats]:
     """Play episodes with a run's deterministic policy.
 
@@ -49,6 +54,7 @@ def evaluate_run(
         backend: the backend to play on; by default the one that the run was trained on.
         episodes: the number of episodes.
         which: the policy, "last" or "best".
+        options: keyword arguments of the environment, in addition to those of the run.
 
     Returns:
         Each of METRICS per episode (episodes,); position error and angle are those of the last step.
@@ -60,7 +66,8 @@ def evaluate_run(
         raise GymMaraError(f"episodes must be at least 1, not {episodes}")
     config = run.config
     backend = backend or config.backend
-    env = make_env(config.env, backend, episodes, options_on(backend, config))
+    settings = {**options_on(backend, config), **(options or {})}
+    env = make_env(config.env, backend, episodes, settings)
     try:
         policy, wrapped = load_policy(run.policy(which), config, env)
         env.seed(config.seed)

@@ -108,7 +108,7 @@ def test_transfer_plays_a_policy_on_every_backend(dynamic_run: RunFolder) -> Non
     ("arguments", "message"),
     [
         ({"episodes": 0}, "episodes must be a whole number of at least 1"),
-        ({"options": {"colour": 1}}, "no installed backend knows the setting 'colour'"),
+        ({"options": {"colour": 1}}, "unknown keyword argument 'colour'"),
         ({"which": "worst"}, "unknown policy"),
     ],
 )
