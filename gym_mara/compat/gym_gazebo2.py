@@ -91,7 +91,7 @@ class GazeboMaraEnv(MaraEnv):
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
         observation, reward, terminated, truncated, info = super().step(action)
         statistics = info["statistics"]

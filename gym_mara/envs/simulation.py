@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
+from gym_mara.envs.actions import joint_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
@@ -127,7 +128,7 @@ class Simulation:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. No arm moves then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. No arm moves then.
             ResetNeeded: the environment was not reset.
             ClosedEnvironmentError: the environment is closed.
         """
@@ -220,10 +221,7 @@ class Simulation:
 
     def _target(self, action: ArrayLike) -> Floats:
         """The joint targets of an action, clipped to the range of joint targets."""
-        try:
-            target = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GymMaraError(f"an action must be an array of numbers: {error}") from error
+        target = joint_targets(action).astype(np.float64, copy=False)
         if target.shape != self._start.shape:
             raise GymMaraError(
                 f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "

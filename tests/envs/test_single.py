@@ -428,7 +428,7 @@ def test_constants_of_the_reward_are_keyword_arguments() -> None:
         (np.array([0.1] * 5 + [np.nan]), "the action contains NaN or infinity; joint targets must"),
         (np.array([0.1] * 5 + [np.inf]), "the action contains NaN or infinity"),
         (np.array([0.1] * 5 + [-np.inf]), "the action contains NaN or infinity"),
-        (["a"] * 6, "an action must be an array of numbers"),
+        (["a"] * 6, "an action must be an array of integers or floats"),
         (None, r"the action has shape \(\)|an action must be"),
     ],
 )
