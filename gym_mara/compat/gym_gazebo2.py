@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.envs.registration import register
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
@@ -33,7 +34,8 @@ class GazeboMaraEnv(MaraEnv):
     """MaraEnv with the interface of gym-gazebo2.
 
     The environment itself truncates an episode, after 2048 steps or after the number of steps from `set_episode_size`.
-    The last `info` of an episode contains gym-gazebo2's statistics under `infos`.
+    The last `info` of an episode contains gym-gazebo2's statistics under `infos`. The action space is Box(-π, π); targets
+    outside the joint limits are clipped to them.
 
     Args:
         task: the name of a task.
@@ -71,6 +73,7 @@ class GazeboMaraEnv(MaraEnv):
         if gui:
             options["render_mode"] = "human"
         super().__init__(task, **options)
+        self.action_space = Box(-np.pi, np.pi, self.simulation.action_space.shape, np.float32)
         self._episode_size = MAX_EPISODE_STEPS
         if original_observation:
             replacement = _position_for_velocity(self.simulation.robot)
@@ -88,7 +91,7 @@ class GazeboMaraEnv(MaraEnv):
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
         observation, reward, terminated, truncated, info = super().step(action)
         statistics = info["statistics"]

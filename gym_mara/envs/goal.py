@@ -87,7 +87,7 @@ class MaraGoalEnv(MaraEnv):
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
         flat, _, terminated, truncated, info = super().step(action)
         goals = self._as_goals(flat)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
+from gym_mara.envs.actions import joint_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
@@ -82,10 +83,11 @@ class Simulation:
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
         )
-        self.action_space = Box(-np.pi, np.pi, (self.robot.num_joints,), np.float32)
-        # The range of joint targets: the intersection of the action space and the joint limits, rad.
-        self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
-        self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
+        # The range of joint targets, rad (m): the joint limits, of a revolute joint within one turn.
+        turn = np.where(self.robot.kinematics().prismatic, np.inf, np.pi)
+        self.target_low = np.maximum(self.robot.lower, -turn)
+        self.target_high = np.minimum(self.robot.upper, turn)
+        self.action_space = _box_within(self.target_low, self.target_high)
 
     @property
     def random(self) -> bool:
@@ -126,7 +128,7 @@ class Simulation:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. No arm moves then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. No arm moves then.
             ResetNeeded: the environment was not reset.
             ClosedEnvironmentError: the environment is closed.
         """
@@ -218,11 +220,8 @@ class Simulation:
         return self.observation(state, self.goal)
 
     def _target(self, action: ArrayLike) -> Floats:
-        """The joint targets of an action, clipped to the action space and the joint limits."""
-        try:
-            target = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GymMaraError(f"an action must be an array of numbers: {error}") from error
+        """The joint targets of an action, clipped to the range of joint targets."""
+        target = joint_targets(action).astype(np.float64, copy=False)
         if target.shape != self._start.shape:
             raise GymMaraError(
                 f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
@@ -266,6 +265,15 @@ class Simulation:
         if not self._closed:
             self._closed = True
             self.backend.close()
+
+
+def _box_within(low: Floats, high: Floats) -> Box[np.float32]:
+    """The largest float32 box within float64 bounds (J,), so that no sampled action is beyond them."""
+    inner_low, inner_high = low.astype(np.float32), high.astype(np.float32)
+    zero = np.float32(0.0)
+    inner_low = np.where(inner_low < low, np.nextafter(inner_low, zero + np.inf), inner_low)
+    inner_high = np.where(inner_high > high, np.nextafter(inner_high, zero - np.inf), inner_high)
+    return Box(inner_low, np.maximum(inner_low, inner_high), dtype=np.float32)
 
 
 def _sensor_noise(state: SimState) -> Floats | None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.envs.actions import joint_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
@@ -86,9 +87,9 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
-        targets = np.asarray(action)[None]
+        targets = joint_targets(action)[None]
         # The viewer steps the simulation in real time, and may replace the targets.
         step = self.simulation.step if self.viewer is None else self.viewer.step
         outcome = step(targets)

@@ -126,7 +126,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the actions have the wrong shape or are not finite, or an ended episode was not reset. No arm
+            GymMaraError: the actions have the wrong type or shape, or are not finite, or an ended episode was not reset. No arm
                 moves then.
         """
         resetting = self._ended
