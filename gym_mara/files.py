@@ -109,15 +109,16 @@ def _first_errors(error: ValidationError) -> str:
     shown = []
     for one in found[:_SHOWN_ERRORS]:
         where = ".".join(map(str, one["loc"]))
-        value = (
-            "" if one["type"] in ("missing", "json_invalid") else f", not {_short(one['input'])}"
-        )
-        shown.append(f"{where}: {one['msg']}{value}" if where else f"{one['msg']}{value}")
+        complete = one["type"] in ("missing", "json_invalid", "value_error")
+        value = "" if complete else f", not {short(one['input'])}"
+        text = one["msg"].removeprefix("Value error, ") + value
+        shown.append(f"{where}: {text}" if where else text)
     more = len(found) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more else "")
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """The value for an error message, in at most 60 characters."""
     try:
         text = repr(value)
     except ValueError:  # an integer with more digits than Python prints

@@ -80,13 +80,10 @@ def train(
 
     if resume is not None:
         _refuse_beside_resume(context)
-        out.print(
-            "Resuming unpickles the run's checkpoint, and a pickle can run any code: "
-            "resume only runs that you trust.",
-            style="yellow",
-            soft_wrap=True,
-        )
-        with _progress(RunFolder.open(resume).config.steps, resume) as on_progress:
+        interrupted = RunFolder.open(resume)
+        if not interrupted.checkpoints():
+            out.print("The run has no checkpoint: it starts from the beginning.", soft_wrap=True)
+        with _progress(interrupted.config.steps, resume) as on_progress:
             run = resume_training(resume, on_progress)
     else:
         config = RunConfig(

@@ -83,8 +83,9 @@ class Simulation:
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
         )
-        # The range of joint targets, rad (m): the joint limits, of a revolute joint within one turn.
-        turn = np.where(self.robot.kinematics().prismatic, np.inf, np.pi)
+        # The range of joint targets, rad (m): the joint limits, of a revolute joint within one turn. π is rounded to
+        # float32, so that the bounds of the action space are exactly those of the targets there.
+        turn = np.where(self.robot.kinematics().prismatic, np.inf, float(np.float32(np.pi)))
         self.target_low = np.maximum(self.robot.lower, -turn)
         self.target_high = np.minimum(self.robot.upper, turn)
         self.action_space = _box_within(self.target_low, self.target_high)

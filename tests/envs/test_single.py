@@ -96,7 +96,8 @@ def test_an_episode_in_the_default_wrappers_gives_no_warning(name: str) -> None:
 def test_the_action_space_spans_the_joint_limits_within_one_turn(robot: str) -> None:
     env = MaraEnv(robot=robot_model(robot))
     limits, space = env.simulation.robot, env.simulation.action_space
-    low, high = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
+    turn = np.float32(np.pi)
+    low, high = np.maximum(limits.lower, -turn), np.minimum(limits.upper, turn)
     assert space.dtype == np.float32
     np.testing.assert_allclose(space.low, low, atol=1e-6)
     np.testing.assert_allclose(space.high, high, atol=1e-6)
@@ -117,7 +118,8 @@ def test_the_action_space_spans_the_whole_travel_of_a_prismatic_joint(tmp_path: 
 def test_rescaled_actions_give_the_targets_of_the_batch_for_stable_baselines3(robot: str) -> None:
     env = MaraEnv(robot=robot_model(robot), on_collision="continue")
     rescaled = RescaleAction(env, np.float32(-1.0), np.float32(1.0))
-    batch = MaraVecEnv(MaraVectorEnv(1, robot=robot_model(robot), autoreset_mode="SameStep"))
+    arms = MaraVectorEnv(1, robot=robot_model(robot), autoreset_mode="SameStep")
+    batch: Any = MaraVecEnv(arms, rescaled.action_space)  # type: ignore[arg-type]
     rescaled.reset()
     joints, rng = env.simulation.robot.num_joints, np.random.default_rng(0)
     for action in [*rng.uniform(-1.0, 1.0, (20, joints)), np.ones(joints), -np.ones(joints)]:
@@ -165,7 +167,7 @@ def test_any_finite_action_keeps_the_observation_in_its_space(
 def test_an_action_is_clipped_to_the_joint_limits_within_one_turn(action: Any) -> None:
     env = MaraEnv(on_collision="continue")
     env.reset()
-    limit = np.minimum([3.1416, 2.35, 2.61, 3.14, 2.56, 3.14], np.pi)
+    limit = np.minimum([3.1416, 2.35, 2.61, 3.14, 2.56, 3.14], np.float32(np.pi))
     np.testing.assert_array_equal(env.step(action)[0][:6], np.clip(action, -limit, limit))
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from gym_mara.agents.algorithms.base import Preset
 from gym_mara.agents.inspection.transfer import SETTLED, settled_after, transfer
+from gym_mara.agents.runs import load_policy
 from gym_mara.agents.runs.evaluation import evaluate_run, make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.callbacks import OnProgress
@@ -126,8 +127,6 @@ def test_an_arm_has_settled_once_its_error_stays_close_to_its_final_value() -> N
 
 
 def test_a_policy_with_other_spaces_is_refused(dynamic_run: RunFolder) -> None:
-    from gym_mara.agents.runs.policy import load_policy
-
-    env = make_env("MARAOrient-v0", "pinocchio", 1, {})
+    simulation = make_env("MARAOrient-v0", "pinocchio", 1, {}).env.simulation
     with pytest.raises(GymMaraError, match="does not fit the environment"):
-        load_policy(dynamic_run.policy("last"), dynamic_run.config, env)
+        load_policy(dynamic_run).check(simulation)
