@@ -100,6 +100,15 @@ class GazeboMaraEnv(MaraEnv):
             info["infos"] = {name: v for name, v in statistics.items() if name != "ep_steps"}
         return observation, reward, terminated, truncated, info
 
+    def save_state(self) -> dict[str, Any]:
+        """A snapshot as in MaraEnv, with the length of the episodes."""
+        return super().save_state() | {"episode_size": self._episode_size}
+
+    def restore_state(self, snapshot: dict[str, Any]) -> None:
+        """Restore a snapshot of an environment with the same arguments."""
+        super().restore_state(snapshot)
+        self._episode_size = snapshot["episode_size"]
+
 
 def _position_for_velocity(robot: RobotModel) -> Part:
     """gym-gazebo2's replacement of the end effector's velocity: J(q)·q, the Jacobian times the joint positions."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
@@ -83,6 +83,8 @@ class Simulation:
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
         )
+        self.observation_space: Space[Any] = self.observation.space
+        """The space of one arm's observation in the form of `present`."""
         # The range of joint targets, rad (m): the joint limits, of a revolute joint within one turn. π is rounded to
         # float32, so that the bounds of the action space are exactly those of the targets there.
         turn = np.where(self.robot.kinematics().prismatic, np.inf, float(np.float32(np.pi)))
@@ -142,7 +144,7 @@ class Simulation:
         if noise is not None:
             self._sensors.measure(state.q, noise)
         observation = self._observe(state, noise)
-        reward, terms = self.task.reward(state, self.goal)
+        reward, terms = self._reward(state, observation)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
         if self.task.on_collision == "terminate":
@@ -158,6 +160,16 @@ class Simulation:
         info = {**terms, "collided": collided, **_report(state)}
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
+
+    def _reward(
+        self, state: SimState, observation: Floats
+    ) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        """The rewards (N,) of a state with its observations (N, O), and their terms."""
+        return self.task.reward(state, self.goal)
+
+    def present(self, flat: Floats) -> Any:
+        """Flat observations (…, O) in the form of the observation space."""
+        return flat
 
     def observed(self, arm: int) -> SimState:
         """The state of an arm's last observation: after a collision, the colliding state, even if the arm was reset."""
