@@ -19,7 +19,7 @@ from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
-from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.errors import GymMaraError, finite_vector, whole_number
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.types import Floats, Mask
@@ -179,13 +179,18 @@ class Simulation:
         return self.outcome.state
 
     def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
-        """Set the goal of every arm to a position (3,), m, and a quaternion (4,), [w, x, y, z], which is normalised."""
-        quaternion = rotations.normalised(np.asarray(quaternion, np.float64))
-        quaternion = rotations.canonical(quaternion)
+        """Set the goal of every arm to a position (3,), m, and a quaternion (4,), [w, x, y, z], which is normalised.
+
+        Raises:
+            GymMaraError: a value has another shape or is not finite, or the quaternion is zero. The goal stays then.
+        """
+        place = finite_vector("position", position, 3)
+        turn = finite_vector("quaternion", quaternion, 4)
+        if not np.linalg.norm(turn) > 1e-6:
+            raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
+        turn = rotations.canonical(rotations.normalised(turn))
         shape = (self.num_envs, 1)
-        self.goal = Goal(
-            np.tile(np.asarray(position, np.float64), shape), np.tile(quaternion, shape)
-        )
+        self.goal = Goal(np.tile(place, shape), np.tile(turn, shape))
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.
