@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, short
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -109,20 +109,10 @@ def _first_errors(error: ValidationError) -> str:
     shown = []
     for one in found[:_SHOWN_ERRORS]:
         where = ".".join(map(str, one["loc"]))
-        value = (
-            "" if one["type"] in ("missing", "json_invalid") else f", not {_short(one['input'])}"
-        )
+        value = "" if one["type"] in ("missing", "json_invalid") else f", not {short(one['input'])}"
         shown.append(f"{where}: {one['msg']}{value}" if where else f"{one['msg']}{value}")
     more = len(found) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more else "")
-
-
-def _short(value: Any) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # an integer with more digits than Python prints
-        return "a huge number"
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def write_text(file: Path, text: str, *, new: bool = False) -> None:
@@ -179,6 +169,35 @@ def replace_folder(new: Path, target: Path) -> None:
         os.replace(target, old)
     os.replace(new, target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def locked(file: Path, busy: str, patience: float = 0.0) -> Iterator[None]:
+    """Hold a lock file in the block; the operating system releases it if this process is killed.
+
+    Args:
+        file: the lock file, made if there is none.
+        busy: the error if another process holds the lock.
+        patience: how long to wait for the lock, s.
+
+    Raises:
+        GymMaraError: another process holds the lock, or the file cannot be made or is not a plain file.
+    """
+    from filelock import FileLock, Timeout
+
+    if os.path.lexists(file) and not stat.S_ISREG(os.lstat(file).st_mode):
+        raise GymMaraError(f"cannot lock {str(file)!r}: it is not a plain file")
+    lock = FileLock(file, timeout=patience)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise GymMaraError(busy) from None
+    except OSError as error:
+        raise GymMaraError(f"cannot lock {str(file)!r}: {_reason(error)}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager
