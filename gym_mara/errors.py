@@ -53,27 +53,15 @@ def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = Fa
     )
 
 
-def whole_number(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
-    """Check that a value is a whole number in a range, 1 or more by default, and return it as an int.
+def whole_number(name: str, value: Any) -> int:
+    """Check that a value is a whole number of at least 1, and return it as an int.
 
     Raises:
         GymMaraError: it is not.
     """
-    if not isinstance(value, bool) and isinstance(value, numbers.Integral):
-        number = int(value)
-        if number >= least and (most is None or number <= most):
-            return number
-    allowed = f"of at least {least}" if most is None else f"from {least} to {most:,}"
-    raise GymMaraError(f"{name} must be a whole number {allowed}, not {short(value)}")
-
-
-def short(value: Any) -> str:
-    """A value's text for an error message, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer with more digits than Python prints
-        return "a huge number"
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
+        raise GymMaraError(f"{name} must be a whole number of at least 1, not {value!r}")
+    return int(value)
 
 
 def unknown(kind: str, name: object, valid: Iterable[str], where: str = "") -> GymMaraError:

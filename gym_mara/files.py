@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gym_mara.errors import GymMaraError, short
+from gym_mara.errors import GymMaraError
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -113,6 +113,15 @@ def _first_errors(error: ValidationError) -> str:
         shown.append(f"{where}: {one['msg']}{value}" if where else f"{one['msg']}{value}")
     more = len(found) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more else "")
+
+
+def short(value: Any) -> str:
+    """The value for an error message, in at most 60 characters."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer with more digits than Python prints
+        return "a huge number"
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def write_text(file: Path, text: str, *, new: bool = False) -> None:

@@ -11,6 +11,7 @@ import csv
 import dataclasses
 import io
 import json
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ import numpy as np
 from gym_mara.backends import DEFAULT_BACKEND, backend_settings
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
-from gym_mara.errors import GymMaraError, positive_number, short, unknown, whole_number
-from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
+from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.files import DamagedFileError, parsed_json, read_text, short, write_text
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.robot.model import is_path
 from gym_mara.tasks import named_task
@@ -94,7 +95,8 @@ def record(
         GymMaraError: a name is unknown, an option has no effect on a reward, or `states` is not a whole number from 2 to
             100,000.
     """
-    whole_number("states", states, least=2, most=MOST_STATES)
+    if not 2 <= whole_number("states", states) <= MOST_STATES:
+        raise GymMaraError(f"states must be from 2 to {MOST_STATES:,}, not {short(states)}")
     simulation = _simulation(env, backend, options or {}, 1)
     try:
         q = _sample_q(simulation, states)
@@ -140,7 +142,7 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
     Raises:
         GymMaraError: the two records do not have the same terms, or the tolerance is negative or not finite.
     """
-    positive_number("tolerance", tolerance, or_zero=True)
+    _check_tolerance(tolerance)
     if recorded.values.keys() != now.values.keys():
         raise GymMaraError(
             f"the record has the terms {', '.join(recorded.values)}, but the task now has {', '.join(now.values)}: "
@@ -162,7 +164,7 @@ def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> li
         GymMaraError: the file is missing or damaged, the task now has other terms, or the tolerance is negative or not
             finite.
     """
-    positive_number("tolerance", tolerance, or_zero=True)
+    _check_tolerance(tolerance)
     recorded = read(file)
     now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
     return compare(recorded, now, tolerance)
@@ -258,6 +260,12 @@ def _plain(value: Any) -> Any:
     raise GymMaraError(
         f"a record holds plain values, not {short(value)}; name a robot by its name, path or modules"
     )
+
+
+def _check_tolerance(tolerance: float) -> None:
+    """Raises GymMaraError if a tolerance is negative or not finite."""
+    if not 0.0 <= tolerance < math.inf:
+        raise GymMaraError(f"tolerance must be finite and not negative, not {tolerance!r}")
 
 
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:

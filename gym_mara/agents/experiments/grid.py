@@ -34,6 +34,7 @@ from gym_mara.files import (
     MissingFileError,
     locked,
     read_json,
+    short,
     write_json,
     writing,
 )
@@ -76,9 +77,13 @@ class Grid:
                 raise GymMaraError(f"a grid needs at least one {kind}")
             if len(set(names)) < len(names):
                 raise GymMaraError(f"{', '.join(names)}: give each name once")
-        whole_number("seeds", self.seeds, most=MOST_SEEDS)
-        whole_number("steps", self.steps, most=MOST_STEPS)
-        whole_number("checkpoint_every", self.checkpoint_every, most=MOST_STEPS)
+        for name, most in (
+            ("seeds", MOST_SEEDS),
+            ("steps", MOST_STEPS),
+            ("checkpoint_every", MOST_STEPS),
+        ):
+            if whole_number(name, value := getattr(self, name)) > most:
+                raise GymMaraError(f"{name} must be at most {most:,}, not {short(value)}")
 
     def runs(self) -> dict[str, RunConfig]:
         """Name → run."""
