@@ -33,6 +33,10 @@ class MissingFileError(DamagedFileError):
     """A file does not exist."""
 
 
+class BusyError(GymMaraError):
+    """Another process holds a lock."""
+
+
 def read_bytes(file: Path, largest: int) -> bytes:
     """Read a plain file of at most this many bytes. Pipes and devices are refused, so that nothing blocks.
 
@@ -190,7 +194,8 @@ def locked(file: Path, busy: str, patience: float = 0.0) -> Iterator[None]:
         patience: how long to wait for the lock, s.
 
     Raises:
-        GymMaraError: another process holds the lock, or the file cannot be made or is not a plain file.
+        BusyError: another process holds the lock.
+        GymMaraError: the file cannot be made or is not a plain file.
     """
     from filelock import FileLock, Timeout
 
@@ -200,7 +205,7 @@ def locked(file: Path, busy: str, patience: float = 0.0) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise GymMaraError(busy) from None
+        raise BusyError(busy) from None
     except OSError as error:
         raise GymMaraError(f"cannot lock {str(file)!r}: {_reason(error)}") from error
     try:
