@@ -33,6 +33,10 @@ class MissingFileError(DamagedFileError):
     """A file does not exist."""
 
 
+class BusyError(GymMaraError):
+    """Another process holds a lock."""
+
+
 def read_bytes(file: Path, largest: int) -> bytes:
     """Read a plain file of at most this many bytes. Pipes and devices are refused, so that nothing blocks.
 
@@ -180,6 +184,36 @@ def replace_folder(new: Path, target: Path) -> None:
         os.replace(target, old)
     os.replace(new, target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def locked(file: Path, busy: str, patience: float = 0.0) -> Iterator[None]:
+    """Hold a lock file in the block; the operating system releases it if this process is killed.
+
+    Args:
+        file: the lock file, made if there is none.
+        busy: the error if another process holds the lock.
+        patience: how long to wait for the lock, s.
+
+    Raises:
+        BusyError: another process holds the lock.
+        GymMaraError: the file cannot be made or is not a plain file.
+    """
+    from filelock import FileLock, Timeout
+
+    if os.path.lexists(file) and not stat.S_ISREG(os.lstat(file).st_mode):
+        raise GymMaraError(f"cannot lock {str(file)!r}: it is not a plain file")
+    lock = FileLock(file, timeout=patience)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BusyError(busy) from None
+    except OSError as error:
+        raise GymMaraError(f"cannot lock {str(file)!r}: {_reason(error)}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager

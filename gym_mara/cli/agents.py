@@ -212,7 +212,9 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
 
 
 def _mean_and_spread(values: Floats) -> str:
-    mean, spread = values.mean(), values.std()
-    if np.isnan(mean):
+    """Mean and standard deviation over the episodes that have a value, and how many have one if some have not."""
+    there = values[~np.isnan(values)]
+    if not len(there):
         return "-"
-    return f"{mean:.2f}" + (f" ± {spread:.2f}" if len(values) > 1 else "")
+    text = f"{there.mean():.2f}" + (f" ± {there.std():.2f}" if len(there) > 1 else "")
+    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} episodes)"
