@@ -11,7 +11,7 @@ from rich.table import Column, Table
 from gym_mara import regression
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.backends import DEFAULT_BACKEND, backend_names
-from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out, task_name
+from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.modules import MODULES
@@ -34,7 +34,10 @@ def list_() -> None:
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
     out.print("Robots:", ", ".join(robot_names()) + ", or the path of a URDF")
-    out.print("Modules of an arm:", ", ".join(MODULES))
+    out.print(
+        f"Modules of an arm: {', '.join(MODULES)}. In this order they make MARA, with 6 joints: "
+        "a motor makes a joint at each of its two faces."
+    )
 
 
 def rewards(
@@ -61,7 +64,7 @@ def rewards(
     if record is not None:
         _refuse(context, "--record compares nothing", "tolerance")
         made = regression.record(
-            task_name(env), backend or DEFAULT_BACKEND, keyword_arguments(settings), states
+            env, backend or DEFAULT_BACKEND, keyword_arguments(settings), states
         )
         regression.write(record, made)
         out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")

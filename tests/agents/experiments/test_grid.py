@@ -75,7 +75,7 @@ def test_a_killed_grid_is_resumed_with_the_same_results(
     finished_grid: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "grid"
-    options = ["--envs", "MARA-v0", "--algos", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
+    options = ["--env", "MARA-v0", "--algo", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
     command = ["-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
     command += ["--checkpoint-every", "2048", "--out", str(folder)]
     with started(*command) as process:

@@ -229,6 +229,5 @@ def test_watch_serves_the_viewer_until_an_interrupt(
         time.sleep(1.0)
         assert watching.poll() is None, "it keeps running"
         watching.send_signal(signal.SIGINT)
-        out, _ = watching.communicate(timeout=30)
+        watching.communicate(timeout=30)
     assert watching.returncode == 130
-    assert "Closed." in out
