@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -28,7 +29,7 @@ import psutil
 from gymnasium.vector import AutoresetMode
 
 import gym_mara  # noqa: F401 - registers the environments
-from gym_mara.backends import installed_backends
+from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.rendering import RENDERERS
 
 ARMS = 8
@@ -37,7 +38,7 @@ EPISODE = 25
 """Episodes are short, so that each round has many of them."""
 GROWTH = 0.01
 """The largest growth of memory that passes."""
-_RANDOMISATION = {"dart": {"randomisation": {"mass": (0.9, 1.1), "sensor_noise": (0.0, 0.01)}}}
+_RANDOMISATION = {"mass": (0.9, 1.1), "sensor_noise": (0.0, 0.01)}
 
 
 @dataclass
@@ -50,17 +51,17 @@ class Tally:
     def observe(self, space: gymnasium.Space[Any], observation: Any, reward: Any) -> None:
         """Count a step, NaN, and observations outside their space."""
         self.done["steps"] += int(np.size(reward))
-        flat = gymnasium.spaces.flatten(space, observation)
-        self.wrong["NaN"] += int(not (np.isfinite(flat).all() and np.isfinite(reward).all()))
+        parts = [*observation.values()] if isinstance(observation, dict) else [observation]
+        self.wrong["NaN"] += int(not all(np.isfinite(part).all() for part in (*parts, reward)))
         self.wrong["outside the space"] += int(not space.contains(observation))
 
     def compare(self, first: list[Any], again: list[Any]) -> None:
-        """Count a restore, and whether the future after it was another one."""
-        self.done["restores"] += 1
+        """Count a comparison of two futures that must be equal."""
+        self.done["comparisons"] += 1
         self.wrong["other future"] += int(pickle.dumps(first) != pickle.dumps(again))
 
 
-def vector(backend: str, mode: AutoresetMode, seed: int, tally: Tally, **options: Any) -> None:
+def vector(seed: int, tally: Tally, *, backend: str, mode: AutoresetMode, **options: Any) -> None:
     """Steps a vector environment, restores a snapshot, and steps again with the same actions."""
     envs: Any = gymnasium.make_vec(
         "gym_mara/MARARandomTarget-v0",
@@ -68,7 +69,6 @@ def vector(backend: str, mode: AutoresetMode, seed: int, tally: Tally, **options
         backend=backend,
         autoreset_mode=mode,
         max_episode_steps=EPISODE,
-        **_RANDOMISATION.get(backend, {}),
         **options,
     )
     try:
@@ -97,7 +97,7 @@ def _step_vector(envs: Any, action: Any, mode: AutoresetMode, tally: Tally) -> A
     return result
 
 
-def single(name: str, backend: str, seed: int, tally: Tally) -> None:
+def single(seed: int, tally: Tally, *, name: str, backend: str) -> None:
     """Steps one environment beyond its TimeLimit, restores a snapshot, and steps again with the same actions."""
     env: Any = gymnasium.make(name, backend=backend, max_episode_steps=EPISODE)
     try:
@@ -123,8 +123,26 @@ def _step(env: Any, action: Any, tally: Tally) -> Any:
     return [observation, reward, terminated, truncated]
 
 
-def pictures(renderer: str, seed: int, tally: Tally) -> None:
-    """Draws the same state in this thread and in two others, and drops the environment without `close()`."""
+def threads(seed: int, tally: Tally, *, backend: str) -> None:
+    """Steps three equal environments at the same time in three threads; their results must be equal."""
+
+    def play(_: int) -> list[Any]:
+        env: Any = gymnasium.make("gym_mara/MARA-v0", backend=backend)
+        try:
+            env.reset(seed=seed)
+            env.action_space.seed(seed)
+            return [_step(env, env.action_space.sample(), tally) for _ in range(STEPS)]
+        finally:
+            env.close()
+
+    with ThreadPoolExecutor(3) as pool:
+        first, *others = pool.map(play, range(3))
+    for other in others:
+        tally.compare(first, other)
+
+
+def pictures(seed: int, tally: Tally, *, renderer: str) -> None:
+    """Draws the same states in this thread and in two others, and drops the environment without `close()`."""
     env: Any = gymnasium.make(
         "gym_mara/MARAOrient-v0",
         render_mode="rgb_array",
@@ -151,22 +169,24 @@ def scenarios() -> dict[str, Callable[[int, Tally], None]]:
     if reasons:
         raise SystemExit("\n".join(reasons))
     for backend in backends:
+        random = "randomisation" in backend_settings(backend)
+        options: dict[str, Any] = {"randomisation": _RANDOMISATION} if random else {}
         for mode in AutoresetMode:
-            found[f"{backend}, {ARMS} arms, {mode.value}"] = lambda seed, tally, b=backend, m=mode: (
-                vector(b, m, seed, tally)
+            found[f"{backend}, {ARMS} arms, {mode.value}"] = partial(
+                vector, backend=backend, mode=mode, **options
             )
         for name in ("MARACollisionOrient-v0", "MARAGoal-v0"):
-            found[f"{backend}, one {name}"] = lambda seed, tally, n=name, b=backend: single(
-                f"gym_mara/{n}", b, seed, tally
+            found[f"{backend}, one {name}"] = partial(
+                single, name=f"gym_mara/{name}", backend=backend
             )
-    found["dart, two worker processes"] = lambda seed, tally: vector(
-        "dart", AutoresetMode.SAME_STEP, seed, tally, workers=2
-    )
-    found["pinocchio, limited joint speed"] = lambda seed, tally: vector(
-        "pinocchio", AutoresetMode.NEXT_STEP, seed, tally, max_joint_velocity=1.57
+        found[f"{backend}, three threads"] = partial(threads, backend=backend)
+    same_step = AutoresetMode.SAME_STEP
+    found["dart, two worker processes"] = partial(vector, backend="dart", mode=same_step, workers=2)
+    found["pinocchio, limited joint speed"] = partial(
+        vector, backend="pinocchio", mode=same_step, max_joint_velocity=1.57
     )
     for renderer in RENDERERS:
-        found[f"pictures, {renderer}"] = lambda seed, tally, r=renderer: pictures(r, seed, tally)
+        found[f"pictures, {renderer}"] = partial(pictures, renderer=renderer)
     return found
 
 
@@ -228,11 +248,11 @@ def _print_page(
     print(f"{count} rounds in {seconds / 60:.0f} minutes, by `python benchmarks/soak.py`, with")
     print(", ".join(f"{package} {version(package)}" for package in packages) + ".\n")
     columns = ("NaN", "outside the space", "other future", "other picture", "black picture")
-    print("| scenario | steps | restores | pictures |", " | ".join(columns), "|")
+    print("| scenario | steps | comparisons | pictures |", " | ".join(columns), "|")
     print("|---" * (4 + len(columns)) + "|")
     failed = False
     for name, tally in tallies.items():
-        done = [f"{tally.done[key]:,}" for key in ("steps", "restores", "pictures")]
+        done = [f"{tally.done[key]:,}" for key in ("steps", "comparisons", "pictures")]
         wrong = [tally.wrong[key] for key in columns]
         failed |= any(wrong)
         print(f"| {name} |", " | ".join([*done, *map(str, wrong)]), "|")
