@@ -8,6 +8,9 @@ import numbers
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 class GymMaraError(ValueError):
     """The base class of gym_mara's errors; most of them report invalid input."""
@@ -53,15 +56,36 @@ def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = Fa
     )
 
 
-def whole_number(name: str, value: Any) -> int:
+def whole_number(name: str, value: Any, or_else: str = "") -> int:
     """Check that a value is a whole number of at least 1, and return it as an int.
+
+    Args:
+        name: the name of the value, for the message.
+        value: the value.
+        or_else: another allowed value, for the message, such as ", or None for no limit".
 
     Raises:
         GymMaraError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
-        raise GymMaraError(f"{name} must be a whole number of at least 1, not {value!r}")
+        raise GymMaraError(f"{name} must be a whole number of at least 1{or_else}, not {value!r}")
     return int(value)
+
+
+def finite_vector(name: str, values: Any, length: int | None = None) -> NDArray[np.float64]:
+    """Check that values are a list of finite numbers, of this length if one is given, and return them as a new array.
+
+    Raises:
+        GymMaraError: they are not.
+    """
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GymMaraError(f"{name} must be a list of numbers, not {values!r}") from error
+    if array.ndim != 1 or length not in (None, len(array)) or not np.isfinite(array).all():
+        count = f"{length} " if length else ""
+        raise GymMaraError(f"{name} must be a list of {count}finite numbers, not {values!r}")
+    return array
 
 
 def unknown(kind: str, name: object, valid: Iterable[str], where: str = "") -> GymMaraError:

@@ -129,6 +129,23 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["--check", "rewards.csv", "--set", "kappa=0.05"], "--set"),
+        (["--check", "rewards.csv", "--env", "MARA-v0"], "--env"),
+        (["--check", "rewards.csv", "--states", "8"], "--states"),
+        (["--record", "rewards.csv", "--tolerance", "1e-6"], "--tolerance"),
+    ],
+)
+def test_an_option_of_rewards_without_effect_is_an_error(
+    gym_mara: Cli, arguments: list[str], option: str
+) -> None:
+    code, _, err = gym_mara("rewards", *arguments)
+    assert code == 2
+    assert f"leave out {option}" in err
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["train", "--env", "MARA-v1"], "Did you mean 'MARA-v0'"),

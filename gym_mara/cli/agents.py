@@ -93,13 +93,10 @@ def train(
     if resume is not None:
         others = (p.name or "" for p in context.command.params if p.name != "resume")
         refuse(context, "--resume uses the options of the run", *others)
-        out.print(
-            "Resuming unpickles the run's checkpoint, and a pickle can run any code: "
-            "resume only runs that you trust.",
-            style="yellow",
-            soft_wrap=True,
-        )
-        with _progress(RunFolder.open(resume).config.steps, resume) as on_progress:
+        interrupted = RunFolder.open(resume)
+        if not interrupted.checkpoints():
+            out.print("The run has no checkpoint: it starts from the beginning.", soft_wrap=True)
+        with _progress(interrupted.config.steps, resume) as on_progress:
             run = resume_training(resume, on_progress)
     else:
         config = RunConfig(
@@ -238,7 +235,9 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
 
 
 def _mean_and_spread(values: Floats) -> str:
-    mean, spread = values.mean(), values.std()
-    if np.isnan(mean):
+    """Mean and standard deviation over the episodes that have a value, and how many have one if some have not."""
+    there = values[~np.isnan(values)]
+    if not len(there):
         return "-"
-    return f"{mean:.2f}" + (f" ± {spread:.2f}" if len(values) > 1 else "")
+    text = f"{there.mean():.2f}" + (f" ± {there.std():.2f}" if len(there) > 1 else "")
+    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} episodes)"

@@ -41,6 +41,7 @@ def list_() -> None:
 
 
 def rewards(
+    context: typer.Context,
     record: Annotated[Path | None, typer.Option(help="New file for the rewards.")] = None,
     check: Annotated[
         Path | None,
@@ -61,12 +62,14 @@ def rewards(
     if (record is None) == (check is None):
         raise GymMaraError("give either --record FILE or --check FILE")
     if record is not None:
+        _refuse(context, "--record compares nothing", "tolerance")
         made = regression.record(
             env, backend or DEFAULT_BACKEND, keyword_arguments(settings), states
         )
         regression.write(record, made)
         out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")
     if check is not None:
+        _refuse(context, "--check takes these from the record", "env", "states", "settings")
         moved = regression.check(check, backend, tolerance)
         for value in moved:
             print(value)
@@ -74,3 +77,14 @@ def rewards(
             print(f"{len(moved)} values of {check} have changed by more than {tolerance:g}")
             raise typer.Exit(1)
         out.print(f"{check}: no value has changed by more than {tolerance:g}")
+
+
+def _refuse(context: typer.Context, reason: str, *names: str) -> None:
+    """Raises GymMaraError if an option that has no effect was given on the command line."""
+    given = []
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+            given.append(parameter.opts[0])
+    if given:
+        raise GymMaraError(f"{reason}: leave out {', '.join(given)}")

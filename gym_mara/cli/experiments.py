@@ -224,17 +224,19 @@ class _GridView:
     """A table of the runs of a grid: their progress and their position errors."""
 
     def __init__(self, folder: Path, grid: Grid) -> None:
-        from gym_mara.agents.experiments.grid import read_result
+        from gym_mara.agents.experiments.grid import valid_result
 
         self._grid = grid
+        self._runs = grid.runs()
         self._started = time.monotonic()
         self._steps: dict[str, int] = {}
         self._shown: dict[str, dict[str, float]] = {}
-        for name in grid.runs():
-            result = read_result(folder / name)
+        for name in self._runs:
+            result = valid_result(folder / name)
             if result is not None:
                 self._steps[name] = grid.steps
-                self._shown[name] = {"eval_position_error_mm": result["last"]["position_error_mm"]}
+                error = result["last"]["position_error_mm"]
+                self._shown[name] = {} if error is None else {"eval_position_error_mm": error}
         self._first: dict[str, int] = dict(self._steps)
         self.notice: Any = out.print
 
@@ -246,18 +248,18 @@ class _GridView:
             steps, shown = message
             self._first.setdefault(name, steps)
             self._steps[name] = min(steps, self._grid.steps)
-            self._shown[name] = shown
+            self._shown[name] = {**self._shown.get(name, {}), **shown}
 
     def table(self) -> Table:
         """The table now: a cell for each pair of environment and algorithm."""
-        total = self._grid.steps * len(self._grid.runs())
+        total = self._grid.steps * len(self._runs)
         done = sum(list(self._steps.values()))
         fresh = done - sum(min(first, self._grid.steps) for first in list(self._first.values()))
         seconds = time.monotonic() - self._started
         left = (total - done) * seconds / fresh if fresh else None
-        title = f"{done / total:.0%} of {len(self._grid.runs())} runs, {_clock(seconds)} so far"
+        title = f"{done / total:.0%} of {len(self._runs)} runs, {_clock(seconds)} so far"
         table = Table("", *(a.upper() for a in self._grid.algos), title=title)
-        table.caption = f"{_clock(left)} left" if left is not None else None
+        table.caption = f"{_clock(left)} left" if left else None
         for env in self._grid.envs:
             cells = (self._cell(env, algo) for algo in self._grid.algos)
             table.add_row(env, *cells)
@@ -265,7 +267,7 @@ class _GridView:
 
     def _cell(self, env: str, algo: str) -> str:
         parts = []
-        for name, run in self._grid.runs().items():
+        for name, run in self._runs.items():
             if (run.env, run.algo) != (env, algo):
                 continue
             part = f"{self._steps.get(name, 0) / self._grid.steps:4.0%}"

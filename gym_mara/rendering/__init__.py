@@ -6,6 +6,10 @@ Graphics libraries are imported when the first picture is drawn.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
+import sys
+import weakref
 from typing import TYPE_CHECKING, Any
 
 from gym_mara.errors import MissingExtraError
@@ -15,6 +19,9 @@ from gym_mara.robot import RobotModel
 
 if TYPE_CHECKING:
     from gym_mara.rendering.renderer import Picture, Renderer
+
+_KEYS = itertools.count()
+"""Numbers the renderers of this process."""
 
 __all__ = ["CAMERAS", "RENDERERS", "Pictures", "RenderSettings", "make_renderer"]
 
@@ -58,7 +65,9 @@ def _renderer_class(name: str) -> type[Renderer]:
 
 
 class Pictures:
-    """Draws the arms of one simulation; it makes its renderer for the first picture.
+    """Draws the arms of one simulation, in any thread; it makes its renderer for the first picture.
+
+    The renderer is freed by `close`, or with this object. A copy, also in a forked process, makes a renderer of its own.
 
     Args:
         robot: the arm.
@@ -67,21 +76,31 @@ class Pictures:
 
     def __init__(self, robot: RobotModel, settings: RenderSettings) -> None:
         self._robot, self._settings = robot, settings
-        self._renderer: Renderer | None = None
+        self._key = next(_KEYS)
+        weakref.finalize(self, _free, self._key, wait=False).atexit = False
 
     def of(self, view: View) -> Picture:
-        """Draw a view: uint8 (height, width, 3), RGB."""
-        if self._renderer is None:
-            at_home = dataclasses.replace(view, q=self._robot.home)
-            self._renderer = make_renderer(self._robot, self._settings, at_home)
-        return self._renderer.render(view)
+        """Draw a view: uint8 (height, width, 3), RGB.
+
+        Raises:
+            MissingExtraError: the chosen renderer is not installed, or no renderer works here.
+            NoDisplayError: the chosen renderer cannot draw on this machine or in this process.
+        """
+        from gym_mara.rendering.drawing import drawing_thread
+
+        at_home = dataclasses.replace(view, q=self._robot.home)
+        make = functools.partial(make_renderer, self._robot, self._settings, at_home)
+        return drawing_thread().draw(self._key, make, view)
 
     def close(self) -> None:
         """Free the renderer, if there is one. The next picture makes a new renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        _free(self._key, wait=True)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A renderer belongs to one process and one environment, so a copy makes its own.
         return Pictures, (self._robot, self._settings)
+
+
+def _free(key: int, *, wait: bool) -> None:
+    """Free a renderer, if a picture was ever drawn; else import nothing."""
+    if drawing := sys.modules.get("gym_mara.rendering.drawing"):
+        drawing.free(key, wait=wait)

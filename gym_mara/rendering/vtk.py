@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import subprocess
 import sys
 from typing import Any, NamedTuple
@@ -37,6 +38,8 @@ with needs("the renderer 'vtk'", "render", "pyvista"):
     from vtkmodules.vtkCommonDataModel import vtkPlane
 
 _SAMPLES = 4
+_process: int | None = None
+"""The process that has loaded OpenGL; a fork of it inherits this value."""
 # Exits with 0 if VTK can draw. It runs in a process of its own, because VTK may crash where it finds no OpenGL.
 _OPENGL_PROBE = """
 import sys
@@ -70,11 +73,18 @@ class VtkRenderer(Renderer):
 
     def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
         super().__init__(scene, camera, settings, first)
+        global _process
+        if _process not in (None, os.getpid()):
+            raise NoDisplayError(
+                "VTK has drawn before this process was forked, and a forked process cannot use the OpenGL of its parent: "
+                "start processes with 'spawn' or 'forkserver', or choose renderer='raycast'"
+            )
         if not _has_opengl():
             raise NoDisplayError(
                 "VTK finds no OpenGL: install EGL or OSMesa (Debian: libegl1 with libgl1-mesa-dri, "
                 "or libosmesa6), or choose renderer='raycast'"
             )
+        _process = os.getpid()
         vtkObject.GlobalWarningDisplayOff()  # VTK warns of each display that it cannot open
         size = [self.width, self.height]
         self._plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import finite_vector, unknown
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
@@ -64,13 +64,7 @@ class Task(ABC):
         values = getattr(self, name)
         if values is None:
             return
-        try:
-            array = np.asarray(values, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GymMaraError(f"{name} must be a list of numbers, not {values!r}") from error
-        if array.ndim != 1 or (length and len(array) != length) or not np.isfinite(array).all():
-            count = f"{length} " if length else ""
-            raise GymMaraError(f"{name} must be a list of {count}finite numbers, not {values!r}")
+        array = finite_vector(name, values, length)
         object.__setattr__(self, name, tuple(array.tolist()))
 
     @abstractmethod

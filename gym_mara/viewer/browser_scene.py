@@ -12,6 +12,7 @@ from gym_mara.rendering.camera import BACKGROUND, VIEW_ANGLE, Camera
 from gym_mara.rendering.scene import Colour, Scene
 from gym_mara.rendering.view import View
 from gym_mara.types import Floats
+from gym_mara.viewer.gate import TARGET
 
 
 class BrowserScene:
@@ -44,7 +45,7 @@ class BrowserScene:
         initial.position, initial.look_at = tuple(camera.eye), tuple(camera.at)
         initial.fov = float(np.radians(VIEW_ANGLE))
         self.target = server.scene.add_transform_controls(
-            "/target",
+            TARGET,
             scale=0.2,
             depth_test=False,
             position=view.target_position,

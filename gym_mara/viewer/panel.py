@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import viser
 from gym_mara.backends import backend_names
 from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.types import Floats
+from gym_mara.viewer.gate import boolean, number, one_of
 
 _SLIDER_STEP = 0.001
 """The resolution of the joint sliders, rad."""
@@ -53,6 +56,14 @@ class Panel:
             ]
         # For each plot: the names of its values, their scale, and the handle.
         self._plots: list[tuple[list[str], float, Any]] = []
+
+    def checks(self) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
+        """The controls, each with the check of its values from a browser."""
+        for control in (self.play, self.step, self.jogging):
+            yield control, boolean
+        for slider in (self._speed, *self.sliders):
+            yield slider, functools.partial(number, low=slider.min, high=slider.max)
+        yield self.backends, functools.partial(one_of, valid=self.backends.options)
 
     @property
     def speed(self) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.view import view_of
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.extras import needs
 from gym_mara.rendering.camera import place_camera
 from gym_mara.rendering.scene import Scene
@@ -26,6 +26,7 @@ with needs("the viewer", "render", "viser"):
     import viser
 
 from gym_mara.viewer.browser_scene import BrowserScene
+from gym_mara.viewer.gate import Gate
 from gym_mara.viewer.panel import Panel
 
 _FRAME_PERIOD = 1.0 / 30.0
@@ -42,7 +43,8 @@ class Viewer:
     """Steps a simulation of one arm and shows it in the browser.
 
     `step` first handles the requests of the user in the browser, then waits until the next step is due, then steps. All
-    of this happens in the thread that calls `step`; viser's threads only store the requests.
+    of this happens in the thread that calls `step`; viser's threads only store the requests. All that comes from a
+    browser has passed the gate (`gym_mara.viewer.gate`).
 
     Args:
         simulation: the simulation.
@@ -59,7 +61,8 @@ class Viewer:
         self._goal: tuple[Floats, Floats] | None = None
         self._backend: str | None = None
         self._due = self._drawn = self._plotted = 0.0
-        self._server = _start_server(settings, simulation.robot.name)
+        gate = Gate(settings.viewer_host)
+        self._server = _start_server(settings, simulation.robot.name, gate)
         self.url = f"http://{settings.viewer_host}:{self._server.get_port()}"
         """The address to open in a browser."""
         view, scene = view_of(simulation, 0), Scene(simulation.robot)
@@ -67,6 +70,8 @@ class Viewer:
         """The initial camera of a browser."""
         self._scene = BrowserScene(self._server, scene, self.camera, view)
         self._panel = Panel(self._server, simulation, view.q)
+        for control, check in self._panel.checks():
+            gate.let_in(control, check)
         self._connect_controls()
 
     def run(self, policy: Callable[[Floats], ArrayLike], episode_steps: int | None) -> None:
@@ -117,8 +122,12 @@ class Viewer:
         self._request(_jogging=True)
 
     def set_speed(self, speed: float) -> None:
-        """Set the speed relative to real time, clipped to the range of its slider."""
-        self._panel.set_speed(speed)
+        """Set the speed relative to real time, clipped to the range of its slider.
+
+        Raises:
+            GymMaraError: it is not a positive number.
+        """
+        self._panel.set_speed(positive_number("speed", speed))
 
     def set_playing(self, playing: bool) -> None:
         """Play, or pause before the next step. A pause lasts only while a browser is connected."""
@@ -215,11 +224,11 @@ def _sender_errors_ignored() -> Iterator[None]:
             raise
 
 
-def _start_server(settings: RenderSettings, robot: str) -> viser.ViserServer:
-    """Start a server on the configured port, or on the next free port.
+def _start_server(settings: RenderSettings, robot: str, gate: Gate) -> viser.ViserServer:
+    """Start a server with this gate on the configured port, or on the next free port.
 
     Raises:
-        GymMaraError: the host is not an address of this machine, or no port is free.
+        GymMaraError: the host is not an address of this machine, no port is free, or viser does not let a gate be installed.
     """
     host, first = settings.viewer_host, settings.viewer_port
     reason: OSError | None = None
@@ -232,7 +241,14 @@ def _start_server(settings: RenderSettings, robot: str) -> viser.ViserServer:
             continue
         if port != first:
             print(f"gym_mara: port {first} is in use; the viewer uses port {port}", flush=True)
-        return viser.ViserServer(host, port, label=f"gym_mara: {robot}", verbose=False)
+        with gate.installed() as guarded:
+            server = viser.ViserServer(host, port, label=f"gym_mara: {robot}", verbose=False)
+        if not guarded.is_set():
+            server.stop()
+            raise GymMaraError(
+                f"the viewer cannot be guarded with viser {viser.__version__}: install viser 1.1.1"
+            )
+        return server
     raise GymMaraError(
         f"the viewer cannot listen on {host!r}, port {first} or any of the next {_PORTS - 1} ports: {reason}; "
         "choose another viewer_host or viewer_port"

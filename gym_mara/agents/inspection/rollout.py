@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.runs.evaluation import make_env
+from gym_mara.agents.runs.evaluation import chose_robot, make_arms
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
 from gym_mara.envs.simulation import Outcome
@@ -24,12 +24,12 @@ class Player:
     Args:
         run: the run.
         backend: the backend.
-        options: keyword arguments of the environment.
+        options: keyword arguments of the environment, from `options_on`.
         which: the policy, "last" or "best".
         episodes: N.
 
     Raises:
-        GymMaraError: the policy is missing, damaged or of another environment, or an option is unknown or out of range.
+        GymMaraError: the policy is missing, damaged or of another environment or robot, or an option is unknown or out of range.
     """
 
     def __init__(
@@ -42,11 +42,10 @@ class Player:
         episodes: int = 1,
     ) -> None:
         config = run.config
-        vec_env = make_env(config.env, backend, episodes, options, max_episode_steps=None)
-        self.env = vec_env.env
+        self.policy = load_policy(run, which)
+        self.env = make_arms(config.env, backend, episodes, options, max_episode_steps=None)
         try:
-            self._targets = vec_env.targets
-            self._policy, self._normalisation = load_policy(run.policy(which), config, vec_env)
+            self.policy.check(self.env.simulation, any_robot=chose_robot(options))
             self._observation, _ = self.env.reset(seed=config.seed)
         except BaseException:
             self.env.close()
@@ -54,9 +53,7 @@ class Player:
 
     def act(self, observation: Floats) -> Floats:
         """The joint targets (N, J), rad, for observations (N, O)."""
-        normalised: Any = self._normalisation.normalize_obs(observation)
-        action, _ = self._policy.predict(normalised, deterministic=True)
-        return self._targets(action)
+        return self.policy.predict(observation)[0]
 
     def step(self) -> Outcome:
         """Let the policy act for one step; the outcome holds the state that the task judged."""

@@ -49,8 +49,7 @@ def film_run(
     with ExitStack() as stack:
         players = []
         for backend in backends:
-            own = options_on(backend, run.config)
-            settings = {**own, **options, "render_mode": "rgb_array"}
+            settings = {**options_on(backend, run.config, options), "render_mode": "rgb_array"}
             players.append(stack.enter_context(Player(run, backend, settings, which=which)))
         period = players[0].env.simulation.backend.control_period
         every = math.ceil(speed / period / rate)
@@ -74,7 +73,7 @@ def watch_run(
     run: RunFolder, backend: str, options: dict[str, Any], which: str, speed: float
 ) -> None:
     """Play a run's policy in the viewer, episode after episode, until the user interrupts."""
-    settings = {**options_on(backend, run.config), **options}
+    settings = options_on(backend, run.config, options)
     with Player(run, backend, settings, which=which) as player:
         act = player.act
     watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
