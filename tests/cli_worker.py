@@ -90,7 +90,7 @@ def _prepare() -> None:
     from gym_mara import cli  # noqa: F401
     from gym_mara.agents.experiments import figures, local_executor, search  # noqa: F401
     from gym_mara.agents.experiments.executor import Job, OnMessage, failure_of
-    from gym_mara.agents.inspection import report, watch  # noqa: F401
+    from gym_mara.agents.inspection import report
     from gym_mara.agents.training.train import use_one_thread
     from gym_mara.viewer.viewer import Viewer
 
@@ -102,6 +102,7 @@ def _prepare() -> None:
         raise KeyboardInterrupt
 
     vars(local_executor)["run_in_processes"] = vars(search)["run_in_processes"] = run_here
+    vars(report)["_VIDEO_SECONDS"] = 0.1
     setattr(Viewer, "run", interrupted)  # noqa: B010
     use_one_thread()
 

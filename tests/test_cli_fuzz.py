@@ -160,7 +160,7 @@ def arguments_of(choose: random.Random) -> list[str]:
     if choose.random() < 0.03:
         return choose.choice([[], ["--help"], ["trian"], [""], ["-"], ["train", "--stepz", "3"]])
     usual = [name for name in COMMANDS if name not in RARE]
-    name = choose.choice(usual if choose.random() < 0.85 else RARE)
+    name = choose.choice(usual if choose.random() < 0.93 else RARE)
     forced = FORCED.get(name, [])
     hostile = choose.choice([0.0, 0.15, 0.5])
     call = [name]
