@@ -89,6 +89,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         folder = folder.resolve()
         folder.mkdir(parents=True, exist_ok=True)
     _check_log(folder)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)  # no line for each trial
     with _replayed(folder / _LOG):
         study = optuna.create_study(
             study_name="search",
@@ -174,7 +175,6 @@ def run_search(
 
 def run_trials(search: Search, folder: Path, send: Send) -> None:
     """Run trials until the search has enough finished ones; several processes may do so."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = open_study(search, folder)
     while finished_trials(study) < search.trials:
         with writing(folder / _LOG):
