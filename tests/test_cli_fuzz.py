@@ -369,3 +369,20 @@ def test_hostile_calls(seeds: range, originals: Path, tmp_path: Path) -> None:
 def test_more_hostile_calls(originals: Path, tmp_path: Path) -> None:
     found = run_calls(range(300, 3300), originals, tmp_path)
     assert not found, "\n\n".join(["", *found])
+
+
+def test_the_checks_find_faults() -> None:
+    before = {"existing": "1", "folder": "16877", "folder/bystander": "2", "run/config.json": "3"}
+    assert faults(["plot", "run"], Ended(0, "", []), before, {**before, "run/table.md": "4"}) == []
+    wrong = [
+        (["list"], Ended(None, "no end", []), before),
+        (["list"], Ended(-11, "", []), before),
+        (["list"], Ended(2, "", []), before),
+        (["list"], Ended(2, "Traceback (most recent call last):", []), before),
+        (["list"], Ended(0, "", ["python -c spawn_main"]), before),
+        (["report", "run"], Ended(0, "", []), {**before, "folder/new.html": "4"}),
+        (["report", "run", "--out", "existing"], Ended(0, "", []), {**before, "existing": "4"}),
+        (["train", "--out", "folder"], Ended(0, "", []), before | {"folder/bystander": "gone"}),
+    ]
+    for call, ended, after in wrong:
+        assert len(faults(call, ended, before, after)) == 1
