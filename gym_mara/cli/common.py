@@ -108,7 +108,6 @@ def names_in(option: str, values: Iterable[str]) -> tuple[str, ...]:
 algorithm_name = one_of("algorithm", lambda: ALGORITHMS)
 backend_name = one_of("backend", backend_names)
 
-SEVERAL = "Several are separated by commas."
 COUNT = whole(1, 10**12)
 EnvOption = Annotated[
     str,
