@@ -31,7 +31,12 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
         GymMaraError: the arms cannot be shared out equally, or the program's main module lacks its guard.
     """
     if workers is not None:
-        workers = whole_number("workers", workers)
+        workers = whole_number(
+            "workers",
+            workers,
+            at_most=max(16, 4 * len(cores())),
+            reason="each is a process, and more than 4 for each core only take memory",
+        )
         if num_envs % workers:
             fitting = [str(n) for n in range(1, num_envs + 1) if num_envs % n == 0]
             raise GymMaraError(

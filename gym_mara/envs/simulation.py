@@ -19,7 +19,7 @@ from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
-from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.types import Floats, Mask
@@ -179,12 +179,10 @@ class Simulation:
 
     def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
         """Set the goal of every arm to a position (3,), m, and a quaternion (4,), [w, x, y, z], which is normalised."""
-        quaternion = rotations.normalised(np.asarray(quaternion, np.float64))
-        quaternion = rotations.canonical(quaternion)
+        point = finite_numbers("position", position, 3)
+        turn = rotations.normalised(np.array(finite_numbers("quaternion", quaternion, 4)))
         shape = (self.num_envs, 1)
-        self.goal = Goal(
-            np.tile(np.asarray(position, np.float64), shape), np.tile(quaternion, shape)
-        )
+        self.goal = Goal(np.tile(point, shape), np.tile(rotations.canonical(turn), shape))
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.

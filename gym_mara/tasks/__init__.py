@@ -43,6 +43,6 @@ def named_task(task: str | Task) -> Task:
     """
     if isinstance(task, Task):
         return task
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise unknown("task", task, TASKS)
     return TASKS[task]
