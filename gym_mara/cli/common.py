@@ -13,7 +13,7 @@ from rich.console import Console
 from gym_mara.agents.algorithms.registry import ALGORITHMS, preset_names
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import TASKS, task_names
 
 out = Console()
 
@@ -58,8 +58,8 @@ def interruptible(message: str) -> Iterator[None]:
 def task_name(env: str) -> str:
     """The name of a task, given with or without the namespace of its id."""
     name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
-    if name not in TASKS:
-        raise unknown("environment", env, TASKS)
+    if name not in TASKS and name not in (names := task_names()):
+        raise unknown("environment", env, names)
     return name
 
 
