@@ -18,7 +18,7 @@ from gym_mara.cli import INTERRUPTED
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
 from gym_mara.rendering import RenderSettings
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import TASKS, task_names
 
 _LARGEST_INTEGER = 2**63
 
@@ -83,8 +83,8 @@ def one_of(kind: str, names: Callable[[], Iterable[str]]) -> Callable[[str], str
 def task_name(env: str) -> str:
     """The name of a task, given with or without the namespace of its id."""
     name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
-    if name not in TASKS:
-        raise typer.BadParameter(str(unknown("environment", env, TASKS)))
+    if name not in TASKS and name not in (names := task_names()):
+        raise typer.BadParameter(str(unknown("environment", env, names)))
     return name
 
 

@@ -22,20 +22,26 @@ from gym_mara.cli.common import (
     whole,
 )
 from gym_mara.errors import GymMaraError
+from gym_mara.registration import environment, environment_id, environment_names
 from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.modules import MODULES
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import named_task
 
 
 def list_() -> None:
     """Show the environments, the algorithms, the backends and the robots."""
     columns = Column("environment", no_wrap=True), "reward uses", "on a collision"
     table = Table(*columns, title="Environments")
-    for name, task in TASKS.items():
+    for name in environment_names():
+        try:
+            task = named_task(environment(name).task)
+        except GymMaraError as error:  # a broken task of another package
+            table.add_row(environment_id(name), str(error), "")
+            continue
         uses = ["distance"]
         uses += ["orientation"] if getattr(task, "orientation", False) else []
         uses += ["collision"] if getattr(task, "collision_penalty", False) else []
-        table.add_row(f"gym_mara/{name}", ", ".join(uses), task.on_collision)
+        table.add_row(environment_id(name), ", ".join(uses), task.on_collision)
     out.print(table)
     table = Table("algorithm", "what it is", "presets", title="Algorithms")
     for entry in ALGORITHMS.values():

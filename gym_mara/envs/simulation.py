@@ -19,7 +19,7 @@ from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
-from gym_mara.errors import GymMaraError, finite_vector, whole_number
+from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
@@ -183,13 +183,13 @@ class Simulation:
         Raises:
             GymMaraError: a value has another shape or is not finite, or the quaternion is zero. The goal stays then.
         """
-        place = finite_vector("position", position, 3)
-        turn = finite_vector("quaternion", quaternion, 4)
+        point = finite_numbers("position", position, 3)
+        turn = np.array(finite_numbers("quaternion", quaternion, 4))
         if not np.linalg.norm(turn) > 1e-6:
             raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
         turn = rotations.canonical(rotations.normalised(turn))
         shape = (self.num_envs, 1)
-        self.goal = Goal(np.tile(place, shape), np.tile(turn, shape))
+        self.goal = Goal(np.tile(point, shape), np.tile(turn, shape))
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.

@@ -20,7 +20,7 @@ from gym_mara.agents.experiments.grid import Grid, Result, read_grid, read_resul
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
 from gym_mara.files import write_text, written_aside
-from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
+from gym_mara.tasks import MAX_EPISODE_STEPS, named_task
 from gym_mara.types import Floats
 
 # Column of the table → where a result holds its value, and how many digits are printed.
@@ -240,7 +240,7 @@ def _rows(grid: Grid, results: dict[str, Result]) -> Iterator[dict[str, Any]]:
             row: dict[str, Any] = {"environment": env, "algorithm": algo, "seeds": len(runs)}
             for title, (path, digits) in COLUMNS.items():
                 values = [_value(run, path) for run in runs]
-                if "angle" in title and not getattr(TASKS[env], "orientation", False):
+                if "angle" in title and not getattr(named_task(env), "orientation", False):
                     values = [math.inf]  # the task does not judge the angle
                 row[title] = interquartile_mean(values), digits
             yield row
