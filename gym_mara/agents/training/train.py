@@ -245,9 +245,13 @@ def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
         os.replace(run.progress_file, kept)
     rows = read_progress(kept) if kept.is_file() else []
     table = CSVOutputFormat(str(run.progress_file))
-    for row in rows:
-        if row["time/total_timesteps"] <= steps:
-            table.write(dict(row), {})
+    try:
+        for row in rows:
+            if row["time/total_timesteps"] <= steps:
+                table.write(dict(row), {})
+    except BaseException:
+        table.close()
+        raise
     kept.unlink(missing_ok=True)
     folder = str(run.path / "tensorboard")
     if steps == 0:

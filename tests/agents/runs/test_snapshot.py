@@ -45,11 +45,13 @@ def same(one: Any, other: Any) -> bool:
         pairs = zip(one.items(), other.items(), strict=True)
         return len(one) == len(other) and all(same(a, b) for a, b in pairs)
     if isinstance(one, (list, tuple, deque)):
-        return len(one) == len(other) and all(
-            same(a, b) for a, b in zip(one, other, strict=True)
-        )
+        return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+        return (
+            one.dtype == other.dtype
+            and one.shape == other.shape
+            and one.tobytes() == other.tobytes()
+        )
     return bool(one == other)
 
 
@@ -64,9 +66,10 @@ def test_a_random_generator_continues_and_spawns_as_before() -> None:
     generator.spawn(2)
     generator.integers(9, dtype=np.int32)  # half of a 64-bit number is kept for later
     copied = decode(encode(generator))
-    assert copied.integers(2**31, size=4, dtype=np.int32).tolist() == generator.integers(
-        2**31, size=4, dtype=np.int32
-    ).tolist()
+    assert (
+        copied.integers(2**31, size=4, dtype=np.int32).tolist()
+        == generator.integers(2**31, size=4, dtype=np.int32).tolist()
+    )
     assert copied.spawn(1)[0].random() == generator.spawn(1)[0].random()
 
 
