@@ -31,7 +31,7 @@ from gym_mara.agents.runs.folder import DamagedRunError, RunFolder, read_progres
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.training import callbacks
 from gym_mara.agents.training import train as train_module
-from gym_mara.agents.training.train import preset_of, resume, train
+from gym_mara.agents.training.train import preset_agent, preset_of, resume, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import ROLLOUT, config, silent
 from tests.helpers import started
@@ -486,3 +486,15 @@ def test_evaluations_have_at_most_as_many_workers_as_arms() -> None:
         assert env.num_envs == 1
     with pytest.raises(GymMaraError, match="workers"):
         make_env("MARA-v0", "dart", 1, {"workers": "two"})
+
+
+def test_an_agent_of_a_preset_for_a_script_trains_as_a_run(
+    finished_run: RunFolder,
+) -> None:
+    asked = finished_run.config
+    model = preset_agent(asked.env, asked.algo, seed=asked.seed)
+    model.learn(asked.steps)
+    mine, theirs = model.policy.state_dict(), parameters(finished_run)
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+    with pytest.raises(GymMaraError, match="unknown keyword argument 'colour'"):
+        preset_agent(colour="red")
