@@ -51,7 +51,9 @@ def read_bytes(file: Path, largest: int) -> bytes:
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode):
                 raise DamagedFileError(f"cannot read {str(file)!r}: it is not a plain file")
-            content = stream.read(largest + 1) if status.st_size <= largest else None
+            # Python allocates what it is asked for, so not more than the file seems to need.
+            expected = min(largest, max(status.st_size, 2**16))
+            content = stream.read(expected + 1) if status.st_size <= largest else None
     except FileNotFoundError:
         raise MissingFileError(f"cannot read {str(file)!r}: there is no such file") from None
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path

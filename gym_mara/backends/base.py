@@ -72,6 +72,9 @@ class Backend(ABC):
     def save(self) -> dict[str, Any]:
         """A snapshot that pickles, and from which the simulation continues identically.
 
+        A training can store it if it consists of plain values, arrays, random generators (PCG64), and lists, tuples and
+        dicts of them.
+
         Where `in_processes` is true every value is an array, a list or a tuple with a row for each arm, or a dict of
         such values. Then a snapshot fits any number of processes.
         """

@@ -25,12 +25,17 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
-from gym_mara.agents.algorithms.registry import algorithm
+from gym_mara.agents.algorithms.registry import (
+    DEFAULT_ALGORITHM,
+    DEFAULT_PRESET,
+    algorithm,
+)
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunConfig, RunFolder, read_progress
 from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 
@@ -128,6 +133,43 @@ def new_model(config: RunConfig) -> OnPolicyAlgorithm:
     except BaseException:
         env.close()
         raise
+
+
+def preset_agent(
+    task: str = "MARA-v0",
+    algo: str = DEFAULT_ALGORITHM,
+    *,
+    preset: str = DEFAULT_PRESET,
+    backend: str = DEFAULT_BACKEND,
+    seed: int = 0,
+    **options: Any,
+) -> OnPolicyAlgorithm:
+    """An untrained agent with the hyperparameters of a preset and its environment, for a script of your own.
+
+    Args:
+        task: the name of a task.
+        algo: the name of an algorithm.
+        preset: the name of a preset.
+        backend: the name of a backend.
+        seed: of the policy, the sampling and the environment.
+        **options: keyword arguments of the environment.
+
+    Returns:
+        A model of Stable-Baselines3, such as PPO. Schedules of the preset end with the steps given to its first `learn`.
+
+    Raises:
+        GymMaraError: a name is unknown, or a value is out of its range.
+    """
+    config = RunConfig(
+        env=task,
+        algo=algo,
+        backend=backend,
+        steps=1,  # not used: the caller calls `learn`
+        seed=seed,
+        env_options=options,
+        preset_name=preset,
+    )
+    return new_model(replace(config, preset=asdict(preset_of(config))))
 
 
 def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
@@ -245,9 +287,13 @@ def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
         os.replace(run.progress_file, kept)
     rows = read_progress(kept) if kept.is_file() else []
     table = CSVOutputFormat(str(run.progress_file))
-    for row in rows:
-        if row["time/total_timesteps"] <= steps:
-            table.write(dict(row), {})
+    try:
+        for row in rows:
+            if row["time/total_timesteps"] <= steps:
+                table.write(dict(row), {})
+    except BaseException:
+        table.close()
+        raise
     kept.unlink(missing_ok=True)
     folder = str(run.path / "tensorboard")
     if steps == 0:
