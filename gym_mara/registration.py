@@ -73,6 +73,11 @@ def environment_id(name: str) -> str:
     return name if "/" in name else f"{_NAMESPACE}/{name}"
 
 
+def file_name(name: str) -> str:
+    """The name of an environment for files and folders: a namespace is separated by a hyphen."""
+    return name.replace("/", "-")
+
+
 def environment_names() -> list[str]:
     """The names that `environment` knows. No other package is imported."""
     return [*ENVIRONMENTS, *(name for name in task_names() if name not in ENVIRONMENTS)]

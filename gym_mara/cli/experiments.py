@@ -28,16 +28,17 @@ from gym_mara.cli.common import (
     SeedsOption,
     StepsOption,
     algorithm_name,
+    env_name,
     interruptible,
     names_in,
     needs_agents,
     one_of,
     out,
     several,
-    task_name,
     whole,
 )
 from gym_mara.errors import GymMaraError, unknown
+from gym_mara.registration import file_name
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def benchmark(
     env: Annotated[
         list[str],
         typer.Option(
-            parser=several(task_name),
+            parser=several(env_name),
             metavar="NAMES",
             help="Environments, separated by commas.",
         ),
@@ -180,7 +181,7 @@ def search(
 
     processes = _processes(jobs)
     wanted = module.Search(env, algo, steps, trials, seeds)
-    folder = out_folder or Path("runs") / f"search_{algo}_{env}"
+    folder = out_folder or Path("runs") / f"search_{algo}_{file_name(env)}"
     study = module.open_study(wanted, folder)
 
     def show_best() -> None:

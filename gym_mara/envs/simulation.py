@@ -59,7 +59,7 @@ class Simulation:
     def __init__(self, options: Options, num_envs: int) -> None:
         self.num_envs = whole_number("num_envs", num_envs)
         self.task, self.robot = options.task, options.robot
-        self._options = options
+        self.options = options
         self.backend_name = options.backend
         self.backend = make_backend(options.backend, self.robot, self.num_envs, options.settings)
         self._workspace = RobotWorkspace(self.robot)
@@ -160,6 +160,10 @@ class Simulation:
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
 
+    def rewards(self, state: SimState) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        """The rewards (N,) of a state without sensor noise, and their terms."""
+        return self._reward(state, self._observe(state, None))
+
     def _reward(
         self, state: SimState, observation: Floats
     ) -> tuple[Floats, dict[str, NDArray[Any]]]:
@@ -202,7 +206,7 @@ class Simulation:
         """
         self._check_open()
         known = backend_settings(name)
-        settings = {key: v for key, v in self._options.settings.items() if key in known}
+        settings = {key: v for key, v in self.options.settings.items() if key in known}
         backend = make_backend(name, self.robot, self.num_envs, settings)
         everyone = np.ones(self.num_envs, np.bool_)
         if backend.random:
@@ -227,7 +231,7 @@ class Simulation:
             self.num_envs,
             backend.control_period,
             backend.joint_velocity,
-            self._options.sensors,
+            self.options.sensors,
         )
 
     def _observe(self, state: SimState, noise: Floats | None) -> Floats:

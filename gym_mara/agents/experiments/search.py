@@ -36,7 +36,7 @@ from gym_mara.files import (
     writing,
     written_aside,
 )
-from gym_mara.tasks import task_names
+from gym_mara.registration import environment_names
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
@@ -61,8 +61,8 @@ class Search:
 
     def check(self) -> None:
         """Raises GymMaraError if a name is unknown or a number is out of range."""
-        if self.env not in task_names():
-            raise unknown("environment", self.env, task_names())
+        if self.env not in environment_names():
+            raise unknown("environment", self.env, environment_names())
         algorithm(self.algo)
         for name, most in (("steps", MOST_STEPS), ("trials", MOST_TRIALS), ("seeds", MOST_SEEDS)):
             if whole_number(name, value := getattr(self, name)) > most:

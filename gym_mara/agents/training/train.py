@@ -183,7 +183,7 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    arguments["policy_kwargs"] = policy_arguments(preset)
+    arguments["policy_kwargs"] = policy_arguments(preset, env.observation_space)
     policy = policy_class(preset.policy)
     make = algorithm(algo).load_class()
     try:
