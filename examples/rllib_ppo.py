@@ -37,7 +37,7 @@ def config(env_id: str = ID, env_runners: int = 2) -> PPOConfig:
 
     return (
         PPOConfig()
-        # Actions in rad: normalised to the action space, RLlib's first policy would be about 3 times as noisy.
+        # Actions in rad: normalised to the action space of ±π, RLlib's first policy would be π times as noisy.
         .environment(env_id, env_config={}, normalize_actions=False, clip_actions=True)
         .env_runners(
             num_env_runners=env_runners,

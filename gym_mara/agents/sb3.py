@@ -33,8 +33,8 @@ class MaraVecEnv(VecEnv):
 
     Args:
         env: the environment, with the autoreset mode SAME_STEP.
-        action_space: the space of the actions (J,), such as `Box(-1, 1, (6,))`, whose bounds are scaled to the range of the
-            joint targets; by default the space of the environment, which is not scaled.
+        action_space: the space of the actions (J,), such as `Box(-1, 1, (6,))`, whose bounds are scaled to those of the
+            environment; by default the space of the environment, which is not scaled.
 
     Raises:
         GymMaraError: the environment has another autoreset mode, or the space has another shape or no bounds.
@@ -204,7 +204,8 @@ def _scaling(env: MaraVectorEnv, space: Box) -> Scaling:
         raise GymMaraError(
             f"action_space must be a bounded Box of shape {simulation.action_space.shape}, not {space}"
         )
-    return Scaling(simulation.target_low, simulation.target_high, space)
+    own = simulation.action_space
+    return Scaling(own.low.astype(np.float64), own.high.astype(np.float64), space)
 
 
 def in_one_batch(arms: VecEnv) -> VecEnv:

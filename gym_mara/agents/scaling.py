@@ -13,12 +13,12 @@ from gym_mara.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """The linear map from a box of actions onto the range of joint targets, as `RescaleAction` has it."""
+    """The linear map from a box of actions onto the action space of an environment, as `RescaleAction` has it."""
 
     low: Floats
-    """The lowest joint targets (J,), rad."""
+    """The lowest actions of the environment (J,), rad."""
     high: Floats
-    """The highest joint targets (J,), rad."""
+    """The highest actions of the environment (J,), rad."""
     space: Box
     """The actions (J,)."""
 

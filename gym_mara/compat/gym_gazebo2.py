@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium.envs.registration import register
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
@@ -34,8 +33,7 @@ class GazeboMaraEnv(MaraEnv):
     """MaraEnv with the interface of gym-gazebo2.
 
     The environment itself truncates an episode, after 2048 steps or after the number of steps from `set_episode_size`.
-    The last `info` of an episode contains gym-gazebo2's statistics under `infos`. The action space is Box(-π, π); targets
-    outside the joint limits are clipped to them.
+    The last `info` of an episode contains gym-gazebo2's statistics under `infos`.
 
     Args:
         task: the name of a task.
@@ -73,7 +71,6 @@ class GazeboMaraEnv(MaraEnv):
         if gui:
             options["render_mode"] = "human"
         super().__init__(task, **options)
-        self.action_space = Box(-np.pi, np.pi, self.simulation.action_space.shape, np.float32)
         self._episode_size = MAX_EPISODE_STEPS
         if original_observation:
             replacement = _position_for_velocity(self.simulation.robot)

@@ -20,6 +20,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_vector, whole_number
+from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.types import Floats, Mask
@@ -85,12 +86,10 @@ class Simulation:
         )
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
-        # The range of joint targets, rad (m): the joint limits, of a revolute joint within one turn. π is rounded to
-        # float32, so that the bounds of the action space are exactly those of the targets there.
-        turn = np.where(self.robot.kinematics().prismatic, np.inf, float(np.float32(np.pi)))
-        self.target_low = np.maximum(self.robot.lower, -turn)
-        self.target_high = np.minimum(self.robot.upper, turn)
-        self.action_space = _box_within(self.target_low, self.target_high)
+        self.action_space = _action_space(self.robot)
+        # The range of joint targets: the intersection of the action space and the joint limits, rad (m).
+        self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
+        self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
 
     @property
     def random(self) -> bool:
@@ -285,13 +284,11 @@ class Simulation:
             self.backend.close()
 
 
-def _box_within(low: Floats, high: Floats) -> Box[np.float32]:
-    """The largest float32 box within float64 bounds (J,), so that no sampled action is beyond them."""
-    inner_low, inner_high = low.astype(np.float32), high.astype(np.float32)
-    zero = np.float32(0.0)
-    inner_low = np.where(inner_low < low, np.nextafter(inner_low, zero + np.inf), inner_low)
-    inner_high = np.where(inner_high > high, np.nextafter(inner_high, zero - np.inf), inner_high)
-    return Box(inner_low, np.maximum(inner_low, inner_high), dtype=np.float32)
+def _action_space(robot: RobotModel) -> Box[np.float32]:
+    """The actions of the paper, ±π for every revolute joint; of a prismatic joint the whole travel, m."""
+    prismatic = robot.kinematics().prismatic
+    low, high = np.where(prismatic, robot.lower, -np.pi), np.where(prismatic, robot.upper, np.pi)
+    return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def _sensor_noise(state: SimState) -> Floats | None:

@@ -304,8 +304,8 @@ def _description(model: OnPolicyAlgorithm) -> PolicyDescription:
     return PolicyDescription(
         format=1,
         joints=list(simulation.robot.joint_names),
-        low=simulation.target_low.tolist(),
-        high=simulation.target_high.tolist(),
+        low=simulation.action_space.low.tolist(),
+        high=simulation.action_space.high.tolist(),
         observation=[ObservationPart(p.name, len(p.low)) for p in simulation.observation.parts],
         normalisation=statistics,
         robot=fingerprint(simulation.robot),
