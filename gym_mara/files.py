@@ -67,6 +67,24 @@ def read_bytes(file: Path, largest: int) -> bytes:
     return content
 
 
+def plain_size(file: Path) -> int:
+    """The size of a plain file, bytes, for a library that reads the file itself.
+
+    Raises:
+        MissingFileError: there is no such file.
+        DamagedFileError: it is not a plain file.
+    """
+    try:
+        status = os.stat(file)
+    except FileNotFoundError:
+        raise MissingFileError(f"cannot read {str(file)!r}: there is no such file") from None
+    except (OSError, ValueError) as error:
+        raise DamagedFileError(f"cannot read {str(file)!r}: {_reason(error)}") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise DamagedFileError(f"cannot read {str(file)!r}: it is not a plain file")
+    return status.st_size
+
+
 def read_text(file: Path, largest: int = LARGEST_TEXT) -> str:
     """Read a plain text file, in UTF-8, of at most this many bytes.
 

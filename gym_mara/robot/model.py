@@ -19,7 +19,7 @@ from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain, visual_geometry
+from gym_mara.robot.urdf import build, check_urdf, ee_frame_among_links, make_chain, visual_geometry
 from gym_mara.types import Floats
 
 
@@ -164,6 +164,7 @@ class RobotModel:
         srdf: Path | None,
         modules: tuple[str, ...] = (),
     ) -> RobotModel:
+        check_urdf(urdf, root)
         chain = make_chain(urdf, root, ee_frame)
         xml = ElementTree.tostring(root, encoding="unicode")
         model, geometry = build(urdf, xml)

@@ -180,7 +180,7 @@ def test_a_configuration_is_checked(mara: RobotModel, q: list[float], message: s
 
 
 def test_a_missing_urdf(tmp_path: Path) -> None:
-    with pytest.raises(GymMaraError, match=r"cannot read the URDF .*none\.urdf.*No such file"):
+    with pytest.raises(GymMaraError, match=r"cannot read .*none\.urdf.*no such file"):
         RobotModel.load(tmp_path / "none.urdf", "link1")
 
 

@@ -83,6 +83,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         GymMaraError: a value is wrong, the folder holds another search, its log is damaged, or it cannot be written.
     """
     search.check()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     start = preset_of(search.config(FIRST_SEED))
     with writing(folder):
         # Resolved because Optuna's lock is a symbolic link, and a relative path would break it.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gym_mara.agents.inspection.rollout import Player, roll_out
-from gym_mara.agents.runs.evaluation import options_beyond_backend
+from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.envs.goal import GoalSettings
@@ -107,7 +107,8 @@ def _play(
     which: str,
 ) -> tuple[Transferred, float | None]:
     """How a policy does on a backend; and if the joints teleport, the robot's lowest velocity limit, rad/s."""
-    with Player(run, backend, {**of_env, **chosen}, which=which, episodes=episodes) as player:
+    options = with_options(of_env, chosen)
+    with Player(run, backend, options, which=which, episodes=episodes) as player:
         played = roll_out(player)
         simulation = player.env.simulation
         robot = simulation.robot

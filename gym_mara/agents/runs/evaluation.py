@@ -101,7 +101,11 @@ def options_on(
         GymMaraError: a name cannot be an option of a run, or the robot cannot be loaded.
     """
     own = config.env_options if backend == config.backend else options_beyond_backend(config)
-    given = options or {}
+    return with_options(own, options or {})
+
+
+def with_options(own: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """The keyword arguments of a run's environment, some of them replaced as in `options_on`."""
     check_options(given, pictures=True)
     merged = {**own, **given}
     if "robot" in given or "ee_frame" in given:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
@@ -37,6 +36,7 @@ from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
+from gym_mara.files import locked
 
 
 def train(
@@ -104,24 +104,10 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
     return _learn(run, model, on_progress, reached)
 
 
-@contextmanager
-def _locked(run: RunFolder) -> Iterator[None]:
-    """Lock a run for this process; the operating system releases the lock if the process is killed.
-
-    Raises:
-        GymMaraError: another process trains it.
-    """
-    lock = FileLock(run.path / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
-    except OSError as error:
-        raise GymMaraError(f"cannot write to {str(run.path)!r}: {error.strerror}") from error
-    try:
-        yield
-    finally:
-        lock.release()
+def _locked(run: RunFolder) -> AbstractContextManager[None]:
+    """Lock a run for this process."""
+    busy = f"another process is training {str(run.path)!r}; wait for it"
+    return locked(run.path / ".lock", busy)
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
