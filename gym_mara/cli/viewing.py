@@ -67,7 +67,16 @@ def watch(
     backends = (backend or folder.config.backend).split(",")
     if video is not None:
         with interruptible("Interrupted; no video was written."):
-            film_run(folder, video, backends, options, which=policy, seconds=seconds, speed=speed)
+            film_run(
+                folder,
+                video,
+                backends,
+                options,
+                which=policy,
+                seconds=seconds,
+                speed=speed,
+                log=_print,
+            )
         out.print(str(video), soft_wrap=True)
         return
     if len(backends) > 1:
@@ -75,7 +84,11 @@ def watch(
             "the viewer shows one backend at a time, and can switch: give one --backend"
         )
     with interruptible("Closed."):
-        watch_run(folder, backends[0], options, policy, speed)
+        watch_run(folder, backends[0], options, policy, speed, _print)
+
+
+def _print(note: str) -> None:
+    out.print(note, soft_wrap=True)
 
 
 def report(

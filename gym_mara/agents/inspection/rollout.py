@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -11,9 +12,13 @@ import numpy as np
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
+from gym_mara.backends import backend_settings
 from gym_mara.envs.simulation import Outcome
 from gym_mara.tasks import MAX_EPISODE_STEPS
 from gym_mara.types import Floats, Mask
+
+VELOCITY_LIMIT = "max_joint_velocity"
+"""The setting with which joints travel that would else teleport."""
 
 
 class Player:
@@ -75,6 +80,28 @@ class Player:
         trace: TracebackType | None,
     ) -> None:
         self.env.close()
+
+
+def velocity_limit(task: str, backend: str, options: dict[str, Any]) -> dict[str, float]:
+    """The setting that makes joints travel that teleport with these options: the robot's lowest velocity limit, rad/s.
+
+    Args:
+        task: the name of a task.
+        backend: the name of a backend.
+        options: keyword arguments of the environment.
+
+    Returns:
+        The setting; nothing if the joints do not teleport, or the backend or the robot has no limit.
+    """
+    if VELOCITY_LIMIT not in backend_settings(backend):
+        return {}
+    vec_env = make_env(task, backend, 1, options)
+    simulation = vec_env.env.simulation
+    vec_env.close()
+    lowest = float(simulation.robot.velocity_limit.min())
+    if not simulation.backend.teleports or not 0.0 < lowest < math.inf:
+        return {}
+    return {VELOCITY_LIMIT: lowest}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Player, roll_out
-from gym_mara.agents.runs.evaluation import make_env, options_beyond_backend
+from gym_mara.agents.inspection.rollout import Player, roll_out, velocity_limit
+from gym_mara.agents.runs.evaluation import options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.errors import GymMaraError, whole_number
@@ -16,8 +16,6 @@ from gym_mara.types import Floats
 
 SETTLED = 0.005
 """An arm has settled once its position error stays this close to its final value, m."""
-_VELOCITY_LIMIT = "max_joint_velocity"
-"""The setting by which a backend whose joints teleport lets them travel."""
 
 
 class Transferred(NamedTuple):
@@ -71,22 +69,11 @@ def transfer(
     rows = []
     for name, known in settings.items():
         chosen = {key: value for key, value in given.items() if key in known}
-        for variant in _variants(run.config.env, name, of_env, chosen):
+        limit = velocity_limit(run.config.env, name, {**of_env, **chosen})
+        for variant in [chosen, {**chosen, **limit}] if limit else [chosen]:
             title = ", ".join([name, *(f"{key}={value}" for key, value in variant.items())])
             rows.append(_play(run, title, name, {**of_env, **variant}, episodes, which))
     return rows
-
-
-def _variants(
-    task: str, backend: str, of_env: dict[str, Any], chosen: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """The settings with which a backend is played: those chosen and, if its joints teleport, with a velocity limit too."""
-    env = make_env(task, backend, 1, {**of_env, **chosen})
-    simulation = env.env.simulation
-    env.close()
-    if not simulation.backend.teleports or _VELOCITY_LIMIT not in backend_settings(backend):
-        return [chosen]
-    return [chosen, {**chosen, _VELOCITY_LIMIT: float(simulation.robot.velocity_limit.min())}]
 
 
 def _play(
