@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -46,7 +47,8 @@ def in_processes(env_id: str = ID) -> VecEnv:
 
 def native() -> VecEnv:
     """Make 256 arms in one batch: by far the fastest."""
-    return MaraVecEnv(MaraVectorEnv(256, "MARA-v0", autoreset_mode="SameStep"))
+    arms = MaraVectorEnv(256, "MARA-v0", autoreset_mode="SameStep")
+    return MaraVecEnv(arms, Box(-1, 1, arms.single_action_space.shape))
 
 
 WAYS: dict[str, Callable[..., Any]] = {

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from stable_baselines3.common.vec_env import VecEnv
 
 import gym_mara  # noqa: F401 - registers the environments
@@ -27,7 +28,7 @@ ROLLOUT = 2
 def make(env_id: str = "gym_mara/MARA-v0") -> VecEnv:
     """Make the arms. Their actions are rescaled to [-1, 1]; JAX converts float64 observations to float32."""
     arms = gymnasium.make_vec(env_id, num_envs=ARMS, autoreset_mode="SameStep")
-    return MaraVecEnv(cast(MaraVectorEnv, arms))
+    return MaraVecEnv(cast(MaraVectorEnv, arms), Box(-1, 1, arms.single_action_space.shape))
 
 
 def train(env: VecEnv, steps: int) -> Any:

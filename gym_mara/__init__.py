@@ -18,5 +18,6 @@ for _name in TASKS:
 register(
     id="gym_mara/MARAGoal-v0",
     entry_point="gym_mara.envs:MaraGoalEnv",
+    vector_entry_point="gym_mara.envs:MaraGoalVectorEnv",
     max_episode_steps=50,
 )

@@ -56,14 +56,19 @@ def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = Fa
     )
 
 
-def whole_number(name: str, value: Any) -> int:
+def whole_number(name: str, value: Any, or_else: str = "") -> int:
     """Check that a value is a whole number of at least 1, and return it as an int.
+
+    Args:
+        name: the name of the value, for the message.
+        value: the value.
+        or_else: another allowed value, for the message, such as ", or None for no limit".
 
     Raises:
         GymMaraError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
-        raise GymMaraError(f"{name} must be a whole number of at least 1, not {value!r}")
+        raise GymMaraError(f"{name} must be a whole number of at least 1{or_else}, not {value!r}")
     return int(value)
 
 

@@ -33,6 +33,10 @@ class MissingFileError(DamagedFileError):
     """A file does not exist."""
 
 
+class BusyError(GymMaraError):
+    """Another process holds a lock."""
+
+
 def read_bytes(file: Path, largest: int) -> bytes:
     """Read a plain file of at most this many bytes. Pipes and devices are refused, so that nothing blocks.
 
@@ -109,15 +113,16 @@ def _first_errors(error: ValidationError) -> str:
     shown = []
     for one in found[:_SHOWN_ERRORS]:
         where = ".".join(map(str, one["loc"]))
-        value = (
-            "" if one["type"] in ("missing", "json_invalid") else f", not {_short(one['input'])}"
-        )
-        shown.append(f"{where}: {one['msg']}{value}" if where else f"{one['msg']}{value}")
+        complete = one["type"] in ("missing", "json_invalid", "value_error")
+        value = "" if complete else f", not {short(one['input'])}"
+        text = one["msg"].removeprefix("Value error, ") + value
+        shown.append(f"{where}: {text}" if where else text)
     more = len(found) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more else "")
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """The value for an error message, in at most 60 characters."""
     try:
         text = repr(value)
     except ValueError:  # an integer with more digits than Python prints
@@ -179,6 +184,36 @@ def replace_folder(new: Path, target: Path) -> None:
         os.replace(target, old)
     os.replace(new, target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def locked(file: Path, busy: str, patience: float = 0.0) -> Iterator[None]:
+    """Hold a lock file in the block; the operating system releases it if this process is killed.
+
+    Args:
+        file: the lock file, made if there is none.
+        busy: the error if another process holds the lock.
+        patience: how long to wait for the lock, s.
+
+    Raises:
+        BusyError: another process holds the lock.
+        GymMaraError: the file cannot be made or is not a plain file.
+    """
+    from filelock import FileLock, Timeout
+
+    if os.path.lexists(file) and not stat.S_ISREG(os.lstat(file).st_mode):
+        raise GymMaraError(f"cannot lock {str(file)!r}: it is not a plain file")
+    lock = FileLock(file, timeout=patience)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BusyError(busy) from None
+    except OSError as error:
+        raise GymMaraError(f"cannot lock {str(file)!r}: {_reason(error)}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager

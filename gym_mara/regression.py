@@ -2,28 +2,40 @@
 
 A record is a CSV file. Its first line is a comment with the environment, the backend and the options. Then follows one
 row per state: the arm's configuration, the terms of the reward, and the reward. A check reads the states from the
-record, so that its result depends only on the code under test.
+record, so that its result depends only on the code under test. A relative path of a robot is relative to the record.
 """
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
+import math
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
-from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.backends import DEFAULT_BACKEND, backend_settings
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.files import DamagedFileError, parsed_json, read_text, short, write_text
 from gym_mara.robot.inverse_kinematics import solve_ik
+from gym_mara.robot.model import is_path
+from gym_mara.tasks import named_task
 from gym_mara.types import Floats
 
+MOST_STATES = 100_000
 _HEADER = "# gym_mara reward record: "
+_LARGEST = 2**26
+"""Of a record, bytes."""
+_BLOCK = 256
+"""How many states are computed at a time."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +45,21 @@ class Record:
     env: str
     backend: str
     options: dict[str, Any]
-    """The keyword arguments of the environment, without the backend."""
+    """Keyword arguments of the environment: those of the task, the robot and the backend."""
     q: Floats
     """The configurations (S, J), rad (m for a prismatic joint)."""
     values: dict[str, Floats]
     """The terms of the reward, `collided` and `reward` by name, each (S,)."""
+
+
+@dataclass(frozen=True)
+class _About:
+    """The first line of a record."""
+
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+    env: str
+    backend: str
+    options: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -70,10 +92,11 @@ def record(
     target, where the reward is steep; the last one is about 0.1 mm or less away from it.
 
     Raises:
-        GymMaraError: a name is unknown, or there are fewer than two states.
+        GymMaraError: a name is unknown, an option has no effect on a reward, or `states` is not a whole number from 2 to
+            100,000.
     """
-    if states < 2:
-        raise GymMaraError(f"states must be at least 2, not {states}")
+    if not 2 <= whole_number("states", states) <= MOST_STATES:
+        raise GymMaraError(f"states must be from 2 to {MOST_STATES:,}, not {short(states)}")
     simulation = _simulation(env, backend, options or {}, 1)
     try:
         q = _sample_q(simulation, states)
@@ -86,29 +109,40 @@ def compute(env: str, backend: str, options: dict[str, Any], q: Floats) -> Recor
     """Compute the rewards of an environment with the arm at rest at configurations q (S, J), rad.
 
     Raises:
-        GymMaraError: a name is unknown, or a configuration has the wrong length or exceeds the joint limits.
+        GymMaraError: a name is unknown, an option has no effect on a reward, or a configuration has the wrong length or
+            exceeds the joint limits.
     """
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
-    simulation = _simulation(env, backend, options, len(q))
+    blocks = [q[start : start + _BLOCK] for start in range(0, len(q), _BLOCK)]
+    simulation = _simulation(env, backend, options, len(blocks[0]))
     try:
         for number, row in enumerate(q):
             simulation.robot.checked_q(row, f"state {number} of the record")
-        simulation.backend.reset(q)
-        state = simulation.backend.state
-        reward, terms = simulation.task.reward(state, simulation.goal)
+        values = [_values(simulation, block) for block in blocks]
     finally:
         simulation.close()
+    columns = {name: np.concatenate([part[name] for part in values]) for name in values[0]}
+    return Record(env, backend, options, q, columns)
+
+
+def _values(simulation: Simulation, q: Floats) -> dict[str, Floats]:
+    """The values at configurations (B, J), of which there are at most as many as arms."""
+    unused = np.repeat(q[-1:], simulation.num_envs - len(q), axis=0)
+    simulation.backend.reset(np.concatenate([q, unused]))
+    state = simulation.backend.state
+    reward, terms = simulation.task.reward(state, simulation.goal)
     values = {**terms, "collided": state.collided.astype(np.float64), "reward": reward}
-    return Record(env, backend, options, q, values)
+    return {name: column[: len(q)] for name, column in values.items()}
 
 
 def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Moved]:
     """The values that differ by more than the tolerance, in the order of the states.
 
     Raises:
-        GymMaraError: the two records do not have the same terms.
+        GymMaraError: the two records do not have the same terms, or the tolerance is negative or not finite.
     """
+    _check_tolerance(tolerance)
     if recorded.values.keys() != now.values.keys():
         raise GymMaraError(
             f"the record has the terms {', '.join(recorded.values)}, but the task now has {', '.join(now.values)}: "
@@ -127,8 +161,10 @@ def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> li
     """Compute the rewards of a record again, on its backend or another, and return the values that have changed.
 
     Raises:
-        GymMaraError: the file is missing or damaged, or the task now has other terms.
+        GymMaraError: the file is missing or damaged, the task now has other terms, or the tolerance is negative or not
+            finite.
     """
+    _check_tolerance(tolerance)
     recorded = read(file)
     now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
     return compare(recorded, now, tolerance)
@@ -138,25 +174,24 @@ def write(file: Path, recorded: Record) -> None:
     """Write a record to a new file.
 
     Raises:
-        GymMaraError: the file exists and is not overwritten, or it cannot be written.
+        GymMaraError: the file exists and is not overwritten, or it cannot be written; a value is not finite, or an option is
+            not a plain value.
     """
-    about = {"env": recorded.env, "backend": recorded.backend, "options": recorded.options}
+    for name, column in recorded.values.items():
+        if not np.isfinite(column).all():
+            state = int(np.argmin(np.isfinite(column)))
+            raise GymMaraError(
+                f"{name} is {column[state]} in state {state}; a record needs numbers"
+            )
+    options = _with_robot(recorded.options, lambda path: os.path.relpath(path, file.parent))
+    about = dataclasses.asdict(_About(recorded.env, recorded.backend, options))
     text = io.StringIO()
-    text.write(_HEADER + json.dumps(about) + "\n")
+    text.write(_HEADER + json.dumps(about, default=_plain) + "\n")
     writer = csv.writer(text, lineterminator="\n")
-    joints = [f"q{j + 1}" for j in range(recorded.q.shape[1])]
-    writer.writerow([*joints, *recorded.values])
+    writer.writerow([*_joint_names(recorded.q.shape[1]), *recorded.values])
     columns = np.column_stack([recorded.q, *recorded.values.values()])
     writer.writerows([repr(value) for value in row] for row in columns.tolist())
-    try:
-        with file.open("x") as stream:
-            stream.write(text.getvalue())
-    except FileExistsError:
-        raise GymMaraError(
-            f"{str(file)!r} exists and is not overwritten: delete it first"
-        ) from None
-    except OSError as error:
-        raise GymMaraError(f"cannot write {str(file)!r}: {error.strerror}") from error
+    write_text(file, text.getvalue(), new=True)
 
 
 def read(file: Path) -> Record:
@@ -165,24 +200,86 @@ def read(file: Path) -> Record:
     Raises:
         GymMaraError: the file is missing or damaged.
     """
+    header, *lines = read_text(file, _LARGEST).splitlines() or [""]
+    if not header.startswith(_HEADER):
+        _refuse(file, "its first line is not the header of a record")
+    about = parsed_json(
+        header.removeprefix(_HEADER), _About, f"{str(file)!r} is not a reward record"
+    )
+    names = lines[0].split(",") if lines else []
+    joints = sum(
+        1 for name, joint in zip(names, _joint_names(len(names)), strict=True) if name == joint
+    )
+    if not joints or "reward" not in names[joints:] or len(set(names)) < len(names):
+        _refuse(file, "its second line does not name the joints q1, q2, … and the terms, each once")
+    if not 1 <= len(lines) - 1 <= MOST_STATES:
+        _refuse(file, f"it has {len(lines) - 1:,} states, and 1 to {MOST_STATES:,} are allowed")
+    rows = [_row(file, number, line, len(names)) for number, line in enumerate(lines[1:], start=3)]
+    columns = np.array(rows).T
+    values = dict(zip(names[joints:], columns[joints:], strict=True))
+    options = _with_robot(about.options, lambda path: os.path.join(file.parent, path))
+    return Record(about.env, about.backend, options, columns[:joints].T, values)
+
+
+def _row(file: Path, number: int, line: str, length: int) -> Floats:
+    """The numbers of a line."""
+    cells = line.split(",")
+    if len(cells) != length:
+        _refuse(file, f"line {number} has {len(cells)} values, not {length}")
     try:
-        header, *lines = file.read_text().splitlines()
-        if not header.startswith(_HEADER):
-            raise ValueError("its first line is not the header of a record")
-        about = json.loads(header.removeprefix(_HEADER))
-        names = lines[0].split(",")
-        columns = np.array([[float(x) for x in line.split(",")] for line in lines[1:]]).T
-        joints = sum(name.removeprefix("q").isdigit() for name in names)
-        values = dict(zip(names[joints:], columns[joints:], strict=True))
-        return Record(about["env"], about["backend"], about["options"], columns[:joints].T, values)
-    except OSError as error:
-        raise GymMaraError(f"cannot read {str(file)!r}: {error.strerror}") from error
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise GymMaraError(f"{str(file)!r} is not a reward record: {error}") from error
+        row = np.array(cells, np.float64)
+    except ValueError as error:
+        _refuse(file, f"line {number}: {error}")
+    if not np.isfinite(row).all():
+        _refuse(file, f"line {number}: {cells[int(np.argmin(np.isfinite(row)))]} is not finite")
+    return row
+
+
+def _refuse(file: Path, reason: str) -> NoReturn:
+    raise DamagedFileError(f"{str(file)!r} is not a reward record: {reason}")
+
+
+def _joint_names(number: int) -> list[str]:
+    return [f"q{joint + 1}" for joint in range(number)]
+
+
+def _with_robot(options: dict[str, Any], moved: Callable[[str], str]) -> dict[str, Any]:
+    """Options in which a relative path of a robot is replaced."""
+    robot = options.get("robot")
+    if not is_path(robot) or os.path.isabs(robot):
+        return options
+    return {**options, "robot": moved(os.fspath(robot))}
+
+
+def _plain(value: Any) -> Any:
+    """An option as a value that JSON knows."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise GymMaraError(
+        f"a record holds plain values, not {short(value)}; name a robot by its name, path or modules"
+    )
+
+
+def _check_tolerance(tolerance: float) -> None:
+    """Raises GymMaraError if a tolerance is negative or not finite."""
+    if not 0.0 <= tolerance < math.inf:
+        raise GymMaraError(f"tolerance must be finite and not negative, not {tolerance!r}")
+
+
+def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
+    """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
+    of_task = [field.name for field in dataclasses.fields(named_task(env))]  # type: ignore[arg-type]
+    known = {"robot", "ee_frame", *of_task, *backend_settings(backend)} - {"workers"}
+    for name in options:
+        if name not in known:
+            raise unknown("keyword argument", name, known, " of a reward record")
 
 
 def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
     """A simulation of N arms, from the keyword arguments of an environment."""
+    _check_options(env, backend, options)
     rest = {name: v for name, v in options.items() if name not in ("robot", "ee_frame")}
     robot, ee_frame = options.get("robot", "mara"), options.get("ee_frame")
     return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)

@@ -7,12 +7,21 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from gym_mara import cli
 from gym_mara.agents.algorithms.registry import ALGORITHMS
+from gym_mara.cli.app import app
+from gym_mara.cli.common import whole
 from gym_mara.tasks import TASKS
+
+
+def _commands() -> dict[str, Any]:
+    """The commands by name."""
+    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 
 
 class Cli:
@@ -49,21 +58,7 @@ def test_list_shows_everything(gym_mara: Cli) -> None:
     assert all(set(entry.summary.split()) <= set(words) for entry in ALGORITHMS.values())
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "train",
-        "evaluate",
-        "transfer",
-        "watch",
-        "report",
-        "benchmark",
-        "plot",
-        "search",
-        "rewards",
-        "list",
-    ],
-)
+@pytest.mark.parametrize("command", sorted(_commands()))
 def test_every_command_has_help(gym_mara: Cli, command: str) -> None:
     code, out, _ = gym_mara(command, "--help")
     assert code == 0
@@ -107,6 +102,11 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     code, out, _ = gym_mara("evaluate", run, "--backend", "pinocchio")
     assert code == 0
     assert "10 episode(s)" in out
+    away = ("--set", "target_position=[0.1, 0.3, 0.9]")
+    _, moved, _ = gym_mara("evaluate", run, *away)
+    assert moved != out
+    _, compared, _ = gym_mara("transfer", run, *away)
+    assert compared.split("position error, mm")[1].split()[1] in moved
     code, _, err = gym_mara("train", "--out", run)
     assert code == 2
     assert "not overwritten" in err
@@ -129,13 +129,30 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["--check", "rewards.csv", "--set", "kappa=0.05"], "--set"),
+        (["--check", "rewards.csv", "--env", "MARA-v0"], "--env"),
+        (["--check", "rewards.csv", "--states", "8"], "--states"),
+        (["--record", "rewards.csv", "--tolerance", "1e-6"], "--tolerance"),
+    ],
+)
+def test_an_option_of_rewards_without_effect_is_an_error(
+    gym_mara: Cli, arguments: list[str], option: str
+) -> None:
+    code, _, err = gym_mara("rewards", *arguments)
+    assert code == 2
+    assert f"leave out {option}" in err
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["train", "--env", "MARA-v1"], "Did you mean 'MARA-v0'"),
         (["train", "--algo", "sac"], "unknown algorithm 'sac'"),
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
-        (["train", "--steps", "0.5"], "--steps must be a whole number"),
-        (["train", "--steps", "nan"], "--steps must be a whole number"),
+        (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
+        (["train", "--steps", "nan"], "'--steps': must be a whole number"),
         (["train", "--set", "robot"], "write NAME=VALUE"),
         (["train", "--set", "robot=ur55"], "Did you mean 'ur5'"),
         (
@@ -145,11 +162,11 @@ def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None
         (["train", "--resume", "nowhere"], "is not a run folder"),
         (["train", "--resume", "nowhere", "--steps", "5", "--algo", "ppo"], "leave out"),
         (["train", "--preset", "papers", "--out", "x"], "unknown preset 'papers'"),
-        (["benchmark", "--algos", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
-        (["benchmark", "--envs", "MARA-v1", "--out", "x"], "unknown environment 'MARA-v1'"),
-        (["benchmark", "--envs", "MARA-v0, MARA-v0", "--out", "x"], "give each name once"),
-        (["benchmark", "--algos", "ppo, trpo ,ppo", "--out", "x"], "give each name once"),
-        (["benchmark", "--jobs", "0", "--out", "x"], "--jobs must be"),
+        (["benchmark", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
+        (["benchmark", "--env", "MARA-v1", "--out", "x"], "unknown environment 'MARA-v1'"),
+        (["benchmark", "--env", "MARA-v0, MARA-v0", "--out", "x"], "give each name once"),
+        (["benchmark", "--algo", "ppo, trpo ,ppo", "--out", "x"], "give each name once"),
+        (["benchmark", "--jobs", "0", "--out", "x"], "'--jobs': must be"),
         (["plot", "nowhere"], "holds no grid"),
         (["search", "--algo", "ppo2", "--out", "x"], "unknown algorithm 'ppo2'"),
         (["evaluate", "nowhere"], "is not a run folder"),
@@ -187,6 +204,121 @@ def test_training_without_torch_names_the_extra(tmp_path: Path) -> None:
         assert result.returncode == 2
         assert "gym_mara[train]" in result.stderr
         assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        ("train --resume run --steps 5 --algo ppo", "leave out --algo, --steps"),
+        ("train --resume run --set robot=ur5", "leave out --set"),
+        ("watch run --env MARA-v0", "a run has its own environment: leave out --env"),
+        ("watch --policy best", "no policy to play: leave out --policy"),
+        ("watch --video film.mp4", "no policy to play: leave out --video"),
+        ("watch --seconds 3", "only --video has a length: leave out --seconds"),
+        ("watch run --seconds 3", "only --video has a length: leave out --seconds"),
+        ("watch --speed 6", "--speed of the viewer must be from 0.1 to 5, not 6"),
+        ("watch --backend pinocchio,dart", "give one --backend"),
+        ("watch --set width=100", "width has no effect here"),
+        ("watch run --video film.mp4 --set viewer_port=1", "viewer_port has no effect here"),
+        ("train --set viewer_host=0.0.0.0", "viewer_host has no effect here"),
+        ("evaluate run --set camera=top", "camera has no effect here"),
+        ("transfer run --set width=5", "width has no effect here"),
+        ("rewards --record x.csv --set height=5", "height has no effect here"),
+        ("benchmark --address host:1", "--address is for --executor ray only"),
+        ("benchmark --executor ray --jobs 2", "--jobs is for --executor local only"),
+        ("rewards --record a --check b", "either --record FILE or --check FILE"),
+    ],
+)
+def test_an_option_without_effect_is_refused(
+    gym_mara: Cli,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    reason: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, err = gym_mara(*command.split())
+    assert code == 2
+    assert reason in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_have_the_same_names_in_every_command() -> None:
+    commands = _commands()
+    shared: dict[str, set[str]] = {}
+    for command in commands.values():
+        for parameter in command.params:
+            if parameter.param_type_name == "option":
+                shared.setdefault(parameter.name, set()).add(parameter.opts[0])
+    shared.pop("out_folder"), shared.pop("out_file")
+    for name, spellings in shared.items():
+        expected = {"settings": "--set", "as_json": "--json"}.get(name, f"--{name}")
+        assert spellings == {expected.replace("_", "-")}
+    for name in ("--envs", "--algos", "--backends", "--policies", "--trial"):
+        assert not any(name in p.opts for c in commands.values() for p in c.params)
+
+
+def _numbers() -> list[tuple[str, str]]:
+    """Every command with each of its options that is a number."""
+    return [
+        (name, parameter.opts[0])
+        for name, command in _commands().items()
+        for parameter in command.params
+        if parameter.metavar in ("N", "X")
+    ]
+
+
+@pytest.mark.parametrize(("command", "option"), _numbers())
+@pytest.mark.parametrize("value", ["nan", "-inf", "1e300", "9" * 5000, "-1", "1M", "", "0x10"])
+def test_every_number_has_a_range(gym_mara: Cli, command: str, option: str, value: str) -> None:
+    needed = [] if command in ("train", "benchmark", "search", "watch", "rewards") else ["run"]
+    code, _, err = gym_mara(command, *needed, option, value)
+    assert code == 2
+    assert f"Invalid value for '{option}': must be a" in err
+    assert " from " in err
+
+
+@pytest.mark.parametrize("value", ["3e5", "300_000", "300000", "300000.0", " 300000"])
+def test_a_whole_number_may_be_written_in_several_ways(value: str) -> None:
+    assert whole(1, 10**6)(value) == 300_000
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("kappa=NaN", "not a finite number"),
+        ("kappa=-Infinity", "not a finite number"),
+        ("kappa=1e999", "not a finite number"),
+        ("kappa=" + "9" * 5000, "not a finite number"),
+        ("target_position=" + "[" * 100_000, "nested too deeply"),
+        ("self=1", "write NAME=VALUE"),
+        ("=1", "write NAME=VALUE"),
+        ("robt=ur5", "Did you mean 'robot'"),
+        ("backand=dart", "Did you mean 'backend'"),
+        ("task=MARA-v0", "give --env"),
+        ("autoreset_mode=Disabled", "the commands set it"),
+    ],
+)
+def test_a_wrong_setting_is_an_error(
+    gym_mara: Cli, tmp_path: Path, setting: str, reason: str
+) -> None:
+    code, out, err = gym_mara("train", "--set", setting, "--out", tmp_path / "run")
+    assert code == 2
+    assert reason in err
+    assert out == ""
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_keyword_is_given_once(gym_mara: Cli) -> None:
+    code, _, err = gym_mara("train", "--set", "kappa=1", "--set", "kappa=2")
+    assert code == 2
+    assert "kappa is given twice" in err
+
+
+@pytest.mark.parametrize("command", sorted(_commands()))
+def test_help_names_the_extra_that_a_command_needs(gym_mara: Cli, command: str) -> None:
+    _, out, _ = gym_mara(command, "--help")
+    assert ("Needs the extra" in out) == (command not in ("list", "rewards"))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 
 from gym_mara.compat.gym_gazebo2 import GazeboMaraEnv
@@ -94,6 +95,10 @@ def test_original_observation_replaces_the_velocity_with_the_jacobian_times_the_
 @pytest.mark.parametrize("options", [{}, {"original_observation": True}, {"real_speed": True}])
 def test_gymnasiums_checker_accepts_the_environment(options: dict[str, Any]) -> None:
     check_env(gymnasium.make("MARACollisionOrient-v0", **options).unwrapped, skip_render_check=True)
+
+
+def test_the_action_space_is_that_of_gym_gazebo2() -> None:
+    assert gymnasium.make("MARA-v0").action_space == Box(-np.pi, np.pi, (6,), np.float32)
 
 
 @pytest.mark.parametrize(("velocity", "speed"), [(None, 0.5), (0.3, 0.3)])

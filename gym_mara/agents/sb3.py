@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium
@@ -11,30 +12,32 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from gym_mara.agents.scaling import Scaling, is_unit_box
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
-from gym_mara.types import Floats, Mask
+from gym_mara.types import Floats, Mask, UnitActions
 
 _KNOWN_WRAPPERS = (OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit, Monitor)
 
 
 class MaraVecEnv(VecEnv):
-    """N arms for Stable-Baselines3; by default actions are in [-1, 1], scaled to each joint's range.
+    """N arms for Stable-Baselines3. Actions are joint targets, rad, or are scaled to them as `RescaleAction` does.
 
     The info of an arm is empty except at the end of its episode. There it holds `terminal_observation`,
     `TimeLimit.truncated`, the `episode` of a Monitor, and the info of MaraEnv at the last step.
 
     Args:
         env: the environment, with the autoreset mode SAME_STEP.
-        action_space: the space of the actions (J,), scaled to that of the environment as `RescaleAction` does.
+        action_space: the space of the actions (J,), such as `Box(-1, 1, (6,))`, whose bounds are scaled to those of the
+            environment; by default the space of the environment, which is not scaled.
 
     Raises:
-        GymMaraError: the environment has another autoreset mode.
+        GymMaraError: the environment has another autoreset mode, or the space has another shape or no bounds.
     """
 
     def __init__(self, env: MaraVectorEnv, action_space: Box | None = None) -> None:
@@ -44,15 +47,11 @@ class MaraVecEnv(VecEnv):
             )
         self.env = env
         own = env.simulation.action_space
-        space: Box = action_space or Box(-1.0, 1.0, own.shape, np.float32)
-        if action_space is None:
-            low, high = env.simulation.target_low, env.simulation.target_high
-        else:
-            low, high = own.low.astype(np.float64), own.high.astype(np.float64)
+        space = own if action_space is None else action_space
+        self._scaling = None if space == own else _scaling(env, space)
+        self._unit = is_unit_box(space)
         super().__init__(env.num_envs, env.single_observation_space, space)
         self.metadata = env.metadata
-        self._target_low, self._low = low, space.low.astype(np.float64)
-        self._span = (high - low) / (space.high.astype(np.float64) - self._low)
         self._actions: NDArray[np.float32] = np.zeros((env.num_envs, *own.shape), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._start = time.time()
@@ -70,9 +69,20 @@ class MaraVecEnv(VecEnv):
     def step_async(self, actions: NDArray[np.float32]) -> None:
         self._actions = actions
 
-    def targets(self, actions: NDArray[np.float32]) -> Floats:
-        """The joint targets (N, J), rad, of actions (N, J)."""
-        return self._target_low + self._span * (np.asarray(actions, np.float64) - self._low)
+    def targets(self, actions: ArrayLike) -> ArrayLike:
+        """The joint targets (N, J), rad, of actions (N, J).
+
+        Raises:
+            GymMaraError: a policy's actions in [-1, 1] are not in the action space of this environment.
+        """
+        if self._scaling is None:
+            return actions  # a policy's UnitActions too, which the environment refuses
+        if isinstance(actions, UnitActions) and not self._unit:
+            raise GymMaraError(
+                f"the policy's actions are in [-1, 1], and those of this environment in {self.action_space}: "
+                "make it with the action space of the policy"
+            )
+        return self._scaling.targets(actions)
 
     def step_wait(
         self,
@@ -121,20 +131,81 @@ class MaraVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
+        """The attribute for each of the arms; the spaces are those of one arm."""
+        source = self if attr_name in ("observation_space", "action_space") else self.env
+        return [getattr(source, attr_name) for _ in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of all arms.
+
+        Raises:
+            GymMaraError: the indices leave out arms.
+        """
+        self._check_all(self._chosen(indices), f"set the attribute {attr_name!r}")
         setattr(self.env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        chosen: Sequence[int] | Iterable[int] = self._get_indices(indices)
-        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [result for _ in chosen]
+        """Call a method of the batch once; the list repeats its result for each arm. `render` gives each arm its picture.
+
+        Raises:
+            GymMaraError: the indices leave out arms.
+        """
+        chosen = self._chosen(indices)
+        if method_name == "render":
+            pictures = self.get_images()
+            return [pictures[index] for index in chosen]
+        self._check_all(chosen, f"call {method_name!r}")
+        return [getattr(self.env, method_name)(*method_args, **method_kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
+        """Whether the arms behave as in this wrapper: true for Monitor, since the info has its `episode`."""
+        return [wrapper_class is Monitor for _ in self._chosen(indices)]
+
+    def _chosen(self, indices: Any) -> list[int]:
+        """The indices of arms as a list: of None, an int, or a sequence, range or array of ints.
+
+        Raises:
+            GymMaraError: an index is not one of the arms.
+        """
+        if indices is None:
+            return list(range(self.num_envs))
+        array = np.atleast_1d(np.asarray(indices))
+        whole = array.ndim == 1 and (array.dtype.kind in "iu" or array.size == 0)
+        if not whole or ((array < 0) | (array >= self.num_envs)).any():
+            raise GymMaraError(
+                f"the indices of arms must be whole numbers from 0 to {self.num_envs - 1}, not {indices!r}"
+            )
+        return [int(index) for index in array]
+
+    def _check_all(self, chosen: list[int], what: str) -> None:
+        """Raises GymMaraError if the indices leave out arms."""
+        if set(chosen) != set(range(self.num_envs)):
+            raise GymMaraError(
+                f"cannot {what} for the arms {chosen} alone: all {self.num_envs} arms are one batch. Give no indices, "
+                "or use make_vec_env, which makes one environment for each arm"
+            )
+
+
+def _scaling(env: MaraVectorEnv, space: Box) -> Scaling:
+    """The map from a space of actions to the joint targets of an environment.
+
+    Raises:
+        GymMaraError: the space has another shape or no bounds.
+    """
+    simulation = env.simulation
+    if (
+        not isinstance(space, Box)
+        or space.shape != simulation.action_space.shape
+        or not space.is_bounded()
+        or not np.all(space.low < space.high)
+    ):
+        raise GymMaraError(
+            f"action_space must be a bounded Box of shape {simulation.action_space.shape}, not {space}"
+        )
+    own = simulation.action_space
+    return Scaling(own.low.astype(np.float64), own.high.astype(np.float64), space)
 
 
 def in_one_batch(arms: VecEnv) -> VecEnv:
@@ -180,7 +251,11 @@ def in_one_batch(arms: VecEnv) -> VecEnv:
     if monitor is not None:
         writer = monitor.results_writer
         file = None if writer is None else writer.file_handler.name
-        batch = VecMonitor(batch, file, monitor.info_keywords)
+        with (
+            warnings.catch_warnings()
+        ):  # it replaces the statistics of the batch, which are the same
+            warnings.filterwarnings("ignore", message=".*already wrapped with a `Monitor`")
+            batch = VecMonitor(batch, file, monitor.info_keywords)
     return batch
 
 

@@ -2,39 +2,90 @@
 
 from __future__ import annotations
 
+import io
+import os
+import signal
 import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 
-import typer
-from rich.console import Console
-from rich.text import Text
-
-from gym_mara.cli import agents, environments, experiments, viewing
-from gym_mara.errors import GymMaraError
-
-app = typer.Typer(
-    help="Train, evaluate and guard agents for the robot arm MARA.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command()(agents.train)
-app.command()(agents.evaluate)
-app.command()(agents.transfer)
-app.command()(viewing.watch)
-app.command()(viewing.report)
-app.command()(experiments.benchmark)
-app.command()(experiments.plot)
-app.command()(experiments.search)
-app.command("list")(environments.list_)
-app.command()(environments.rewards)
+FAILED = 2
+"""The exit code of a command that cannot do its work; 1 is for a check that found a difference."""
+INTERRUPTED = 130
+"""The exit code after Ctrl-C or SIGTERM."""
 
 
 def main() -> None:
-    """Run the command; an error that the user can correct is printed as one line, without a traceback."""
+    """Run the command, and end the process with 0, 1 (a check found a difference), 2 (an error) or 130 (interrupted)."""
+    with _terminated_like_interrupted():
+        code = _run()
+        try:
+            if sys.stdout is not None:  # it is None if it was closed before the start
+                sys.stdout.flush()
+        except OSError as error:
+            code = _output_failed(error)
+    sys.exit(code)
+
+
+def _run() -> int:
+    """Run the command. An expected error is one line on stderr; a traceback is shown only for a fault of gym_mara."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a table must not fail in a Latin-1 terminal
     try:
-        app()
-    except GymMaraError as error:
-        # A Text, because rich would read the brackets of an extra, as in gym_mara[train], as markup.
-        text = Text.assemble(("error: ", "bold red"), str(error))
-        Console(stderr=True).print(text, soft_wrap=True)
-        sys.exit(2)
+        from gym_mara.cli.app import run  # the imports take a moment, and may be interrupted
+
+        return run(sys.argv[1:])
+    except KeyboardInterrupt:
+        return _failed("Interrupted.", INTERRUPTED)
+    except SystemExit:  # of Typer, when the reader of stdout has closed it
+        return FAILED
+    except MemoryError:
+        return _failed("error: the memory is not enough; ask for less")
+    except RecursionError:
+        return _failed("error: the input is nested too deeply")
+    except OSError as error:
+        if error.filename is None:  # an error of the output
+            return _output_failed(error)
+        return _failed(f"error: {error.strerror}: {error.filename!r}")
+    except Exception:
+        traceback.print_exc()
+        return _failed("error: this is a fault of gym_mara; please report it with the lines above")
+
+
+def _failed(message: str, code: int = FAILED) -> int:
+    with suppress(OSError):
+        print(message, file=sys.stderr)
+    return code
+
+
+def _output_failed(error: OSError) -> int:
+    """Report that stdout cannot be written; without a message if its reader has closed it, as `head` does."""
+    with suppress(OSError, ValueError, AttributeError):
+        # What is still buffered goes nowhere; Python would report it again when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(error, BrokenPipeError):
+        return FAILED
+    return _failed(f"error: cannot write the output: {error.strerror or error}")
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """Let SIGTERM do what Ctrl-C does: what is open is closed, and nothing is left half written."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not callable(signal.getsignal(signal.SIGINT)):  # ignored, as under nohup
+            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -18,15 +19,18 @@ from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     AlgoOption,
     BackendOption,
+    CheckpointOption,
     EnvOption,
     PolicyOption,
     PresetOption,
+    RunBackendOption,
     SetOption,
+    StepsOption,
     interruptible,
     keyword_arguments,
     needs_agents,
     out,
-    task_name,
+    refuse,
     whole,
 )
 from gym_mara.errors import GymMaraError
@@ -35,6 +39,13 @@ from gym_mara.types import Floats
 if TYPE_CHECKING:
     from gym_mara.agents.runs.folder import RunFolder
 
+RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
+EpisodesOption = Annotated[
+    int,
+    typer.Option(
+        parser=whole(1, 1000), metavar="N", help="How many episodes to play, on each backend."
+    ),
+]
 _UNITS = {
     "position_error_mm": "position error, mm",
     "angle_deg": "angle, deg",
@@ -49,11 +60,14 @@ def train(
     env: EnvOption = "MARA-v0",
     algo: AlgoOption = DEFAULT_ALGORITHM,
     backend: BackendOption = DEFAULT_BACKEND,
-    steps: Annotated[
-        float, typer.Option(help="Environment steps over all arms, such as 1e6.")
-    ] = 1e6,
+    steps: StepsOption = 1_000_000,
     seed: Annotated[
-        int, typer.Option(help="Seed of the policy, the sampling and the environment.")
+        int,
+        typer.Option(
+            parser=whole(0, 2**32 - 1),
+            metavar="N",
+            help="Seed of the policy, the sampling and the environment.",
+        ),
     ] = 0,
     out_folder: Annotated[
         Path | None,
@@ -63,96 +77,87 @@ def train(
         ),
     ] = None,
     preset: PresetOption = DEFAULT_PRESET,
-    checkpoint_every: Annotated[
-        float, typer.Option(help="Steps between two checkpoints; each is evaluated.")
-    ] = 5e4,
+    checkpoint_every: CheckpointOption = 50_000,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     resume: Annotated[
         Path | None,
         typer.Option(help="Resume this run from its last checkpoint, with its own options."),
     ] = None,
 ) -> None:
-    """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log."""
+    """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log. Needs the extra train."""
     with needs_agents():
         from gym_mara.agents.runs.folder import RunConfig, RunFolder
         from gym_mara.agents.training.train import resume as resume_training
         from gym_mara.agents.training.train import train as start_training
 
     if resume is not None:
-        _refuse_beside_resume(context)
-        out.print(
-            "Resuming unpickles the run's checkpoint, and a pickle can run any code: "
-            "resume only runs that you trust.",
-            style="yellow",
-            soft_wrap=True,
-        )
-        with _progress(RunFolder.open(resume).config.steps, resume) as on_progress:
+        others = (p.name or "" for p in context.command.params if p.name != "resume")
+        refuse(context, "--resume uses the options of the run", *others)
+        interrupted = RunFolder.open(resume)
+        if not interrupted.checkpoints():
+            out.print("The run has no checkpoint: it starts from the beginning.", soft_wrap=True)
+        with _progress(interrupted.config.steps, resume) as on_progress:
             run = resume_training(resume, on_progress)
     else:
         config = RunConfig(
-            env=task_name(env),
+            env=env,
             algo=algo,
             backend=backend,
-            steps=whole("--steps", steps),
+            steps=steps,
             seed=seed,
-            checkpoint_every=whole("--checkpoint-every", checkpoint_every),
+            checkpoint_every=checkpoint_every,
             preset_name=preset,
             env_options=keyword_arguments(settings),
         )
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = out_folder or Path("runs") / f"{algo}_{config.env}_{backend}_seed{seed}_{stamp}"
+        folder = out_folder or Path("runs") / f"{algo}_{env}_{backend}_seed{seed}_{stamp}"
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress)
     _print_evaluation(run, episodes=1)
     out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 
-def _refuse_beside_resume(context: typer.Context) -> None:
-    """Raises GymMaraError if other options are given: a run is resumed with its own."""
-    given = []
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name != "resume" and source is not None and source.name == "COMMANDLINE":
-            given.append(parameter.opts[0])
-    if given:
-        raise GymMaraError(f"--resume uses the options of the run: leave out {', '.join(given)}")
-
-
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="A run folder.")],
-    backend: Annotated[
-        str | None, typer.Option(help="Backend to play on; by default that of the run.")
-    ] = None,
-    episodes: Annotated[int, typer.Option(help="How many episodes to play.")] = 10,
+    run: RunArgument,
+    backend: RunBackendOption = None,
+    episodes: EpisodesOption = 10,
     policy: PolicyOption = "last",
+    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
 ) -> None:
-    """Play a run's deterministic policy: position error and angle at the last step, reward, collisions."""
+    """Play a run's deterministic policy: position error and angle at the last step, reward, collisions.
+
+    Needs the extra train.
+    """
     with needs_agents():
         from gym_mara.agents.runs.evaluation import evaluate_run, spread
         from gym_mara.agents.runs.folder import RunFolder
 
+    options = keyword_arguments(settings)
     folder = RunFolder.open(run)
     if as_json:
-        metrics = evaluate_run(folder, backend=backend, episodes=episodes, which=policy)
+        metrics = evaluate_run(
+            folder, backend=backend, episodes=episodes, which=policy, options=options
+        )
         print(json.dumps(spread(metrics), indent=2))
     else:
-        _print_evaluation(folder, backend=backend, episodes=episodes, which=policy)
+        _print_evaluation(folder, backend=backend, episodes=episodes, which=policy, options=options)
 
 
 def transfer(
-    run: Annotated[Path, typer.Argument(help="A run folder.")],
-    episodes: Annotated[int, typer.Option(help="How many episodes to play on each backend.")] = 1,
+    run: RunArgument,
+    episodes: EpisodesOption = 1,
     policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Play a run's policy on every installed backend, and compare the results."""
+    """Play a run's policy on every installed backend, and compare the results. Needs the extra train."""
     with needs_agents():
         from gym_mara.agents.inspection.transfer import transfer as play_on_all
         from gym_mara.agents.runs.folder import RunFolder
 
+    options = keyword_arguments(settings)
     folder = RunFolder.open(run)
-    rows = play_on_all(folder, episodes=episodes, which=policy, options=keyword_arguments(settings))
+    rows = play_on_all(folder, episodes=episodes, which=policy, options=options)
     names = (
         "position error, mm",
         "angle, deg",
@@ -171,7 +176,7 @@ def transfer(
 
 @contextmanager
 def _progress(total: int, run: Path) -> Iterator[Any]:
-    """A progress bar, updated by the function that this yields; after an interrupt it says how to resume."""
+    """A progress bar, updated by the function that this yields; after an interrupt it says what is kept."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -180,13 +185,10 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
-    interrupted = (
-        f"Interrupted. The last checkpoint is kept; resume with\ngym-mara train --resume {run}"
-    )
     bar = Progress(*columns, console=out)
     task = bar.add_task("", total=total)
 
-    with interruptible(interrupted):
+    with interruptible(lambda: _kept(run)):
 
         def on_progress(steps: int, shown: dict[str, float]) -> None:
             bar.start()  # not before the training has started: an error before shows no bar
@@ -198,7 +200,25 @@ def _progress(total: int, run: Path) -> Iterator[Any]:
         try:
             yield on_progress
         finally:
-            bar.stop()
+            if bar.live.is_started:
+                bar.stop()
+
+
+def _kept(path: Path) -> str:
+    """What an interrupted training has left in its folder, and how to resume it."""
+    from gym_mara.agents.runs.folder import RunFolder
+
+    try:
+        run = RunFolder.open(path)
+    except GymMaraError:
+        return "Interrupted. Nothing was saved."
+    checkpoints = run.checkpoints()
+    kept = (
+        f"The checkpoint at step {int(checkpoints[-1].name):,} is kept; resume"
+        if checkpoints
+        else "There is no checkpoint yet; start again from the beginning"
+    )
+    return f"Interrupted. {kept} with gym-mara train --resume {shlex.quote(str(path))}"
 
 
 def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
@@ -215,7 +235,9 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
 
 
 def _mean_and_spread(values: Floats) -> str:
-    mean, spread = values.mean(), values.std()
-    if np.isnan(mean):
+    """Mean and standard deviation over the episodes that have a value, and how many have one if some have not."""
+    there = values[~np.isnan(values)]
+    if not len(there):
         return "-"
-    return f"{mean:.2f}" + (f" ± {spread:.2f}" if len(values) > 1 else "")
+    text = f"{there.mean():.2f}" + (f" ± {there.std():.2f}" if len(there) > 1 else "")
+    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} episodes)"

@@ -11,7 +11,7 @@ from rich.table import Column, Table
 from gym_mara import regression
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.backends import DEFAULT_BACKEND, backend_names
-from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out, task_name
+from gym_mara.cli.common import EnvOption, SetOption, keyword_arguments, out
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.modules import MODULES
@@ -34,10 +34,14 @@ def list_() -> None:
     out.print(table)
     out.print("Backends:", ", ".join(backend_names()))
     out.print("Robots:", ", ".join(robot_names()) + ", or the path of a URDF")
-    out.print("Modules of an arm:", ", ".join(MODULES))
+    out.print(
+        f"Modules of an arm: {', '.join(MODULES)}. In this order they make MARA, with 6 joints: "
+        "a motor makes a joint at each of its two faces."
+    )
 
 
 def rewards(
+    context: typer.Context,
     record: Annotated[Path | None, typer.Option(help="New file for the rewards.")] = None,
     check: Annotated[
         Path | None,
@@ -58,12 +62,14 @@ def rewards(
     if (record is None) == (check is None):
         raise GymMaraError("give either --record FILE or --check FILE")
     if record is not None:
+        _refuse(context, "--record compares nothing", "tolerance")
         made = regression.record(
-            task_name(env), backend or DEFAULT_BACKEND, keyword_arguments(settings), states
+            env, backend or DEFAULT_BACKEND, keyword_arguments(settings), states
         )
         regression.write(record, made)
         out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")
     if check is not None:
+        _refuse(context, "--check takes these from the record", "env", "states", "settings")
         moved = regression.check(check, backend, tolerance)
         for value in moved:
             print(value)
@@ -71,3 +77,14 @@ def rewards(
             print(f"{len(moved)} values of {check} have changed by more than {tolerance:g}")
             raise typer.Exit(1)
         out.print(f"{check}: no value has changed by more than {tolerance:g}")
+
+
+def _refuse(context: typer.Context, reason: str, *names: str) -> None:
+    """Raises GymMaraError if an option that has no effect was given on the command line."""
+    given = []
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+            given.append(parameter.opts[0])
+    if given:
+        raise GymMaraError(f"{reason}: leave out {', '.join(given)}")

@@ -16,22 +16,28 @@ from gym_mara.agents.algorithms.registry import (
     ALGORITHMS,
     DEFAULT_ALGORITHM,
     DEFAULT_PRESET,
-    preset_names,
 )
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.backends.processes import cores
 from gym_mara.cli.common import (
     AlgoOption,
     BackendOption,
+    CheckpointOption,
     EnvOption,
     PresetOption,
+    SeedsOption,
+    StepsOption,
+    algorithm_name,
     interruptible,
+    names_in,
     needs_agents,
+    one_of,
     out,
+    several,
     task_name,
     whole,
 )
-from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.errors import GymMaraError, unknown
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
@@ -40,32 +46,45 @@ if TYPE_CHECKING:
 
 EXECUTORS = ("local", "ray")
 
-StepsOption = Annotated[float, typer.Option(help="Environment steps of each run, such as 1e6.")]
 JobsOption = Annotated[
-    int | None, typer.Option(help="How many runs at a time; by default one on each core.")
+    int | None,
+    typer.Option(
+        parser=whole(1, 1024),
+        metavar="N",
+        help="How many runs at a time; by default one on each core.",
+    ),
 ]
 
 
 def benchmark(
-    envs: Annotated[str, typer.Option(help="Environments, separated by commas.")] = ",".join(
-        PAPER_TASKS
-    ),
-    algos: Annotated[
-        str | None,
-        typer.Option(help="Algorithms, separated by commas; by default all that have the preset."),
+    env: Annotated[
+        list[str],
+        typer.Option(
+            parser=several(task_name),
+            metavar="NAMES",
+            help="Environments, separated by commas.",
+        ),
+    ] = [*PAPER_TASKS],  # noqa: B006 - Typer reads it and never changes it
+    algo: Annotated[
+        list[str] | None,
+        typer.Option(
+            parser=several(algorithm_name),
+            metavar="NAMES",
+            help="Algorithms, separated by commas; by default all that have the preset.",
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Runs of each pair, with the seeds 0, 1, …")] = 3,
-    steps: StepsOption = 1e6,
+    seeds: SeedsOption = 3,
+    steps: StepsOption = 1_000_000,
     preset: PresetOption = DEFAULT_PRESET,
     backend: BackendOption = DEFAULT_BACKEND,
-    checkpoint_every: Annotated[
-        float, typer.Option(help="Steps between two checkpoints of a run.")
-    ] = 5e4,
+    checkpoint_every: CheckpointOption = 50_000,
     jobs: JobsOption = None,
     executor: Annotated[
         str,
         typer.Option(
-            help="Where the runs are trained: local, on this machine, or ray, on a cluster."
+            parser=one_of("executor", lambda: EXECUTORS),
+            metavar="NAME",
+            help="Where the runs are trained: local, on this machine, or ray, on a cluster.",
         ),
     ] = "local",
     address: Annotated[
@@ -79,25 +98,28 @@ def benchmark(
         typer.Option("--out", help="Folder of the grid; an interrupted grid is resumed."),
     ] = None,
 ) -> None:
-    """Train every algorithm on every environment with every seed; an interrupted grid is resumed."""
+    """Train every algorithm on every environment with every seed; an interrupted grid is resumed.
+
+    Needs the extra train, and --executor ray the extra ray.
+    """
     with needs_agents():
         from gym_mara.agents.experiments.figures import plot_grid
         from gym_mara.agents.experiments.grid import Grid, open_grid, run_grid
 
     grid = Grid(
-        envs=tuple(task_name(env.strip()) for env in envs.split(",")),
-        algos=_algorithms(algos, preset),
+        envs=names_in("--env", env),
+        algos=names_in("--algo", algo) if algo else _all_algorithms(preset),
         seeds=seeds,
-        steps=whole("--steps", steps),
+        steps=steps,
         preset_name=preset,
         backend=backend,
-        checkpoint_every=whole("--checkpoint-every", checkpoint_every),
+        checkpoint_every=checkpoint_every,
     )
     run_jobs = _executor(executor, jobs, address)
     folder = out_folder or Path("runs") / f"benchmark_{preset}"
     open_grid(folder, grid)
     with interruptible(
-        "Interrupted. Finished runs are kept, the others resume from their last checkpoint:\n"
+        "Interrupted. Finished runs are kept, the others resume from their last checkpoint: "
         "run the same command again"
     ):
         view = _GridView(folder, grid)
@@ -105,7 +127,7 @@ def benchmark(
             view.notice = live.console.print
             failed = run_grid(folder, grid, run_jobs, view.on_message)
     for name, reason in failed.items():
-        out.print(f"{name} failed: {reason}", style="red", markup=False, soft_wrap=True)
+        out.print(f"{name} failed: {reason}", style="red", soft_wrap=True)
     if len(failed) < len(grid.runs()):
         for file in plot_grid(folder):
             out.print(str(file), soft_wrap=True)
@@ -115,53 +137,50 @@ def benchmark(
         )
 
 
-def _algorithms(names: str | None, preset: str) -> tuple[str, ...]:
-    """The algorithms of a grid: those that are named, or else all that have the preset."""
-    if names is not None:
-        return tuple(name.strip() for name in names.split(","))
-    if preset not in preset_names():
-        raise unknown("preset", preset, preset_names())
+def _all_algorithms(preset: str) -> tuple[str, ...]:
+    """The algorithms that have a preset."""
     return tuple(name for name, entry in ALGORITHMS.items() if preset in entry.presets)
 
 
 def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:
-    """Draw the figures of a benchmark and write its tables."""
+    """Draw the figures of a benchmark and write its tables. Needs the extra train."""
     with needs_agents():
         from gym_mara.agents.experiments.figures import plot_grid
 
     for file in plot_grid(folder):
         out.print(str(file), soft_wrap=True)
-    out.print((folder / "table.md").read_text(), markup=False, soft_wrap=True)
+    out.print((folder / "table.md").read_text(), soft_wrap=True)
 
 
 def search(
     env: EnvOption = "MARACollisionOrient-v0",
     algo: AlgoOption = DEFAULT_ALGORITHM,
-    steps: StepsOption = 1e6,
+    steps: StepsOption = 1_000_000,
     trials: Annotated[
         int,
-        typer.Option(help="How many trials in all; a few more if several run at the same time."),
+        typer.Option(
+            parser=whole(1, 100_000),
+            metavar="N",
+            help="How many trials in all; a few more if several run at the same time.",
+        ),
     ] = 40,
-    seeds: Annotated[int, typer.Option(help="How many runs make a trial.")] = 1,
+    seeds: SeedsOption = 1,
     jobs: JobsOption = None,
     out_folder: Annotated[
         Path | None,
         typer.Option("--out", help="Folder of the search; an interrupted search is resumed."),
     ] = None,
 ) -> None:
-    """Search an algorithm's hyperparameters with Optuna, on seeds that no reported result uses."""
+    """Search an algorithm's hyperparameters with Optuna, on seeds that no reported result uses.
+
+    Needs the extra train.
+    """
     with needs_agents():
         from gym_mara.agents.experiments import search as module
 
     processes = _processes(jobs)
-    wanted = module.Search(
-        task_name(env),
-        algo,
-        whole("--steps", steps),
-        whole("--trials", trials),
-        whole("--seeds", seeds),
-    )
-    folder = out_folder or Path("runs") / f"search_{algo}_{wanted.env}"
+    wanted = module.Search(env, algo, steps, trials, seeds)
+    folder = out_folder or Path("runs") / f"search_{algo}_{env}"
     study = module.open_study(wanted, folder)
 
     def show_best() -> None:
@@ -198,47 +217,49 @@ def _executor(name: str, jobs: int | None, address: str | None) -> Executor:
 
 
 def _processes(jobs: int | None) -> int:
-    return len(cores()) if jobs is None else whole_number("--jobs", jobs)
+    return len(cores()) if jobs is None else jobs
 
 
 class _GridView:
     """A table of the runs of a grid: their progress and their position errors."""
 
     def __init__(self, folder: Path, grid: Grid) -> None:
-        from gym_mara.agents.experiments.grid import read_result
+        from gym_mara.agents.experiments.grid import valid_result
 
         self._grid = grid
+        self._runs = grid.runs()
         self._started = time.monotonic()
         self._steps: dict[str, int] = {}
         self._shown: dict[str, dict[str, float]] = {}
-        for name in grid.runs():
-            result = read_result(folder / name)
+        for name in self._runs:
+            result = valid_result(folder / name)
             if result is not None:
                 self._steps[name] = grid.steps
-                self._shown[name] = {"eval_position_error_mm": result["last"]["position_error_mm"]}
+                error = result["last"]["position_error_mm"]
+                self._shown[name] = {} if error is None else {"eval_position_error_mm": error}
         self._first: dict[str, int] = dict(self._steps)
         self.notice: Any = out.print
 
     def on_message(self, name: str, message: Any) -> None:
         """Show a notice of a run, or keep its progress for the table."""
         if isinstance(message, str):
-            self.notice(f"{name}: {message}", style="yellow", markup=False, soft_wrap=True)
+            self.notice(f"{name}: {message}", style="yellow", soft_wrap=True)
         elif message is not None:
             steps, shown = message
             self._first.setdefault(name, steps)
             self._steps[name] = min(steps, self._grid.steps)
-            self._shown[name] = shown
+            self._shown[name] = {**self._shown.get(name, {}), **shown}
 
     def table(self) -> Table:
         """The table now: a cell for each pair of environment and algorithm."""
-        total = self._grid.steps * len(self._grid.runs())
+        total = self._grid.steps * len(self._runs)
         done = sum(list(self._steps.values()))
         fresh = done - sum(min(first, self._grid.steps) for first in list(self._first.values()))
         seconds = time.monotonic() - self._started
         left = (total - done) * seconds / fresh if fresh else None
-        title = f"{done / total:.0%} of {len(self._grid.runs())} runs, {_clock(seconds)} so far"
+        title = f"{done / total:.0%} of {len(self._runs)} runs, {_clock(seconds)} so far"
         table = Table("", *(a.upper() for a in self._grid.algos), title=title)
-        table.caption = f"{_clock(left)} left" if left is not None else None
+        table.caption = f"{_clock(left)} left" if left else None
         for env in self._grid.envs:
             cells = (self._cell(env, algo) for algo in self._grid.algos)
             table.add_row(env, *cells)
@@ -246,7 +267,7 @@ class _GridView:
 
     def _cell(self, env: str, algo: str) -> str:
         parts = []
-        for name, run in self._grid.runs().items():
+        for name, run in self._runs.items():
             if (run.env, run.algo) != (env, algo):
                 continue
             part = f"{self._steps.get(name, 0) / self._grid.steps:4.0%}"

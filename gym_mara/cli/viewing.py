@@ -12,24 +12,34 @@ from gym_mara.cli.common import (
     EnvOption,
     PolicyOption,
     SetOption,
+    backend_name,
     interruptible,
     keyword_arguments,
+    names_in,
     needs_agents,
+    number,
     out,
-    task_name,
+    refuse,
+    several,
 )
-from gym_mara.errors import GymMaraError, positive_number
+from gym_mara.errors import GymMaraError
+
+VIEWER_SPEEDS, VIDEO_SPEEDS = (0.1, 5.0), (0.01, 100.0)
+"""The lowest and the highest speed, times real time."""
 
 
 def watch(
+    context: typer.Context,
     run: Annotated[
         Path | None, typer.Argument(help="A run folder; without one, jog the joints.")
     ] = None,
     env: EnvOption = "MARA-v0",
     backend: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
-            help="Backend; by default that of the run. A video may show several, separated by commas."
+            parser=several(backend_name),
+            metavar="NAMES",
+            help="Backend; by default that of the run. A video may show several, separated by commas.",
         ),
     ] = None,
     policy: PolicyOption = "last",
@@ -38,33 +48,59 @@ def watch(
         typer.Option(help="Write a new file, .mp4 or .gif, instead of opening the viewer."),
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="Times real time; the viewer allows 0.1 to 5.")
+        float,
+        typer.Option(
+            parser=number(*VIDEO_SPEEDS),
+            metavar="X",
+            help="Times real time; the viewer allows {:g} to {:g}.".format(*VIEWER_SPEEDS),
+        ),
     ] = 1.0,
     seconds: Annotated[
-        float, typer.Option(help="Length of the episode that a video shows, s.")
+        float,
+        typer.Option(
+            parser=number(0.1, 3600.0),
+            metavar="X",
+            help="Length of the episode that a video shows, s.",
+        ),
     ] = 6.0,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Watch a run's policy in the browser, or film it; without a run, jog the joints."""
-    options = keyword_arguments(settings)
-    positive_number("--speed", speed)
-    positive_number("--seconds", seconds, "s")
-    if run is None and video is not None:
-        raise GymMaraError("--video films a run's policy: give a run folder")
+    """Watch a run's policy in the browser, or film it; without a run, jog the joints.
+
+    Needs the extra render, and with a run the extra train.
+    """
+    if run is None:
+        refuse(context, "without a run folder there is no policy to play", "policy", "video")
+    else:
+        refuse(context, "a run has its own environment", "env")
+    if video is None:
+        refuse(context, "the viewer has no end; only --video has a length", "seconds")
+        if not VIEWER_SPEEDS[0] <= speed <= VIEWER_SPEEDS[1]:
+            raise GymMaraError(
+                "--speed of the viewer must be from {:g} to {:g}, not {:g}".format(
+                    *VIEWER_SPEEDS, speed
+                )
+            )
+    options = keyword_arguments(settings, pictures=video is not None, viewer=video is None)
+    chosen = names_in("--backend", backend or [])
+    if video is None and len(chosen) > 1:
+        raise GymMaraError(
+            "the viewer shows one backend at a time, and can switch: give one --backend"
+        )
     if run is None:
         from gym_mara.viewer import watch as open_viewer
 
         # A user who jogs the arm into the table should see it there, not reset to its start.
         keywords = {"on_collision": "continue", **options}
         with interruptible("Closed."):
-            open_viewer(task_name(env), backend or DEFAULT_BACKEND, keywords, speed=speed)
+            open_viewer(env, chosen[0] if chosen else DEFAULT_BACKEND, keywords, speed=speed)
         return
     with needs_agents():
         from gym_mara.agents.inspection.watch import film_run, watch_run
         from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
-    backends = (backend or folder.config.backend).split(",")
+    backends = list(chosen) or [folder.config.backend]
     if video is not None:
         with interruptible("Interrupted; no video was written."):
             film_run(
@@ -79,10 +115,6 @@ def watch(
             )
         out.print(str(video), soft_wrap=True)
         return
-    if len(backends) > 1:
-        raise GymMaraError(
-            "the viewer shows one backend at a time, and can switch: give one --backend"
-        )
     with interruptible("Closed."):
         watch_run(folder, backends[0], options, policy, speed, _print)
 
@@ -99,7 +131,10 @@ def report(
         typer.Option("--out", help="The page; by default report.html in the run folder."),
     ] = None,
 ) -> None:
-    """Write an HTML page about a run: curves, an episode on every backend, the tool's path, a video, the configuration."""
+    """Write an HTML page about a run: curves, an episode on every backend, the tool's path, a video, the configuration.
+
+    Needs the extras train and render.
+    """
     with needs_agents():
         from gym_mara.agents.inspection.report import write_report
         from gym_mara.agents.runs.folder import RunFolder

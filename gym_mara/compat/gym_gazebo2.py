@@ -88,7 +88,7 @@ class GazeboMaraEnv(MaraEnv):
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
         observation, reward, terminated, truncated, info = super().step(action)
         statistics = info["statistics"]
@@ -96,6 +96,15 @@ class GazeboMaraEnv(MaraEnv):
         if terminated or truncated:
             info["infos"] = {name: v for name, v in statistics.items() if name != "ep_steps"}
         return observation, reward, terminated, truncated, info
+
+    def save_state(self) -> dict[str, Any]:
+        """A snapshot as in MaraEnv, with the length of the episodes."""
+        return super().save_state() | {"episode_size": self._episode_size}
+
+    def restore_state(self, snapshot: dict[str, Any]) -> None:
+        """Restore a snapshot of an environment with the same arguments."""
+        super().restore_state(snapshot)
+        self._episode_size = snapshot["episode_size"]
 
 
 def _position_for_velocity(robot: RobotModel) -> Part:

@@ -1,8 +1,9 @@
-"""MaraGoalEnv: a goal environment in the format of Gymnasium-Robotics, for algorithms such as hindsight replay."""
+"""Goal environments in the format of Gymnasium-Robotics, for algorithms such as hindsight replay."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,161 @@ from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 
 from gym_mara import rotations
+from gym_mara.envs.options import Options
+from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
+from gym_mara.envs.vector import MaraVectorEnv
 from gym_mara.errors import GymMaraError, positive_number, unknown
+from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
-from gym_mara.types import Floats
+from gym_mara.types import Floats, Mask
 
 REWARD_TYPES = ("sparse", "dense")
 
 
-class MaraGoalEnv(MaraEnv):
+@dataclass(frozen=True)
+class GoalSettings:
+    """When a goal is reached, and what that is worth; the keyword arguments of MaraGoalEnv.
+
+    Raises:
+        GymMaraError: a value is out of its range.
+    """
+
+    reward_type: str
+    position_tolerance: float
+    angle_tolerance: float
+
+    def __post_init__(self) -> None:
+        if self.reward_type not in REWARD_TYPES:
+            raise unknown("reward_type", self.reward_type, REWARD_TYPES)
+        positive_number("position_tolerance", self.position_tolerance, "m")
+        positive_number("angle_tolerance", self.angle_tolerance, "rad")
+
+
+class GoalSimulation(Simulation):
+    """A simulation whose observations are dictionaries, and whose rewards can be computed again for other goals.
+
+    Args:
+        options: as in Simulation; the task is a ReachTask.
+        num_envs: N.
+        settings: the tolerances and the reward.
+
+    Raises:
+        GymMaraError: the task is not a reach task.
+    """
+
+    def __init__(self, options: Options, num_envs: int, settings: GoalSettings) -> None:
+        super().__init__(options, num_envs)
+        if not isinstance(self.task, ReachTask):
+            raise GymMaraError(f"a goal environment needs a reach task, not {self.task!r}")
+        self._reach, self._settings = self.task, settings
+        achieved, desired = (
+            [observation.tool_position(self.robot)],
+            [observation.target_position(self.robot)],
+        )
+        if self._reach.orientation:
+            achieved.append(observation.tool_quaternion())
+            desired.append(observation.target_quaternion())
+        groups: dict[str, list[Part]] = {
+            "observation": [
+                observation.joint_positions(self.robot),
+                observation.tool_velocity(self.robot, self.backend.joint_velocity),
+            ],
+            "achieved_goal": achieved,
+            "desired_goal": desired,
+        }
+        self.observation = Observation([part for parts in groups.values() for part in parts])
+        spaces: dict[str, Space[Any]] = {}
+        self._columns: dict[str, slice] = {}
+        start = 0
+        for name, parts in groups.items():
+            box = Observation(parts).space
+            spaces[name], self._columns[name] = box, slice(start, start + box.shape[0])
+            start += box.shape[0]
+        self.observation_space = Dict(spaces)
+
+    def present(self, flat: Floats) -> dict[str, Floats]:
+        """The groups of flat observations (…, O) by name."""
+        return {name: np.ascontiguousarray(flat[..., own]) for name, own in self._columns.items()}
+
+    def _reward(
+        self, state: SimState, observation: Floats
+    ) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        _, terms = super()._reward(state, observation)
+        achieved, desired = (
+            observation[:, self._columns[name]] for name in ("achieved_goal", "desired_goal")
+        )
+        success = self._succeeds(achieved, desired)
+        if self._settings.reward_type == "sparse":
+            reward = success - 1.0
+        else:
+            reward = self._dense(achieved, desired, state.collided)
+        return reward, terms | {"is_success": success}
+
+    def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+        """The rewards of goals, as in MaraGoalEnv."""
+        if self._settings.reward_type == "sparse":
+            return self._succeeds(achieved, desired) - 1.0
+        collided = np.zeros(len(np.atleast_2d(achieved)), np.bool_)
+        if self._reach.collision_penalty:
+            infos = [info] if isinstance(info, Mapping) else list(info)
+            if not all("collided" in one for one in infos):
+                raise GymMaraError(
+                    "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
+                )
+            collided = np.array([one["collided"] for one in infos])
+        reward = self._dense(np.atleast_2d(achieved), np.atleast_2d(desired), collided)
+        return reward.reshape(np.shape(achieved)[:-1])
+
+    def _dense(self, achieved: Floats, desired: Floats, collided: Mask) -> Floats:
+        """The rewards (N,) of the task for goals (N, G)."""
+        goal = Goal(*self._poses(desired))
+        return self._reach.judge(*self._poses(achieved), collided, goal)[0]
+
+    def _succeeds(self, achieved: Floats, desired: Floats) -> Any:
+        """Which goals (…, G) are reached."""
+        away = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
+        near = away <= self._settings.position_tolerance
+        if self._reach.orientation:
+            angle = rotations.angle_between(achieved[..., 3:], desired[..., 3:])
+            near &= angle <= self._settings.angle_tolerance
+        return near
+
+    def _poses(self, goal: Floats) -> tuple[Floats, Floats]:
+        """The positions (N, 3) and the quaternions (N, 4) of goals (N, G)."""
+        if self._reach.orientation:
+            return goal[:, :3], goal[:, 3:]
+        return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
+
+
+class _GoalEnv:
+    """The methods of a goal environment in Gymnasium-Robotics."""
+
+    simulation: Any
+
+    def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
+        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+
+        Args:
+            achieved_goal: the poses of the end effector.
+            desired_goal: the target poses.
+            info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
+
+        Raises:
+            GymMaraError: the task has a collision penalty, and an info has no `collided`.
+        """
+        return self.simulation.compute_reward(achieved_goal, desired_goal, info)
+
+    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
+        """False: an episode continues after the goal is reached."""
+        return False
+
+    def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
+        """False: a goal truncates no episode."""
+        return False
+
+
+class MaraGoalEnv(_GoalEnv, MaraEnv):
     """One arm; the reward of a step can be computed again for another goal.
 
     The observation is a dictionary. `observation` holds the joint positions (J,), rad, and the velocity of the end
@@ -45,109 +192,38 @@ class MaraGoalEnv(MaraEnv):
         angle_tolerance: float = 0.1,
         **options: Any,
     ) -> None:
-        if reward_type not in REWARD_TYPES:
-            raise unknown("reward_type", reward_type, REWARD_TYPES)
-        self.reward_type = reward_type
-        self.position_tolerance = positive_number("position_tolerance", position_tolerance, "m")
-        self.angle_tolerance = positive_number("angle_tolerance", angle_tolerance, "rad")
+        self._goals = GoalSettings(reward_type, position_tolerance, angle_tolerance)
         super().__init__(task, **options)
-        if not isinstance(self.simulation.task, ReachTask):
-            raise GymMaraError(f"a goal environment needs a reach task, not {task!r}")
-        self.task = self.simulation.task
-        robot, backend = self.simulation.robot, self.simulation.backend
-        self._groups: dict[str, list[Part]] = {
-            "observation": [
-                observation.joint_positions(robot),
-                observation.tool_velocity(robot, backend.joint_velocity),
-            ],
-            "achieved_goal": [observation.tool_position(robot)],
-            "desired_goal": [observation.target_position(robot)],
-        }
-        if self.task.orientation:
-            self._groups["achieved_goal"].append(observation.tool_quaternion())
-            self._groups["desired_goal"].append(observation.target_quaternion())
-        self.simulation.observation = Observation(
-            [part for parts in self._groups.values() for part in parts]
-        )
-        spaces: dict[str, Space[Any]] = {
-            name: Observation(parts).space for name, parts in self._groups.items()
-        }
-        self.observation_space = Dict(spaces)  # type: ignore[assignment]
 
-    def reset(  # type: ignore[override]
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Floats], dict[str, Any]]:
-        """Begin an episode at the start pose."""
-        flat, info = super().reset(seed=seed, options=options)
-        return self._as_goals(flat), info
+    def _make_simulation(self, options: Options) -> Simulation:
+        return GoalSimulation(options, 1, self._goals)
 
-    def step(  # type: ignore[override]
-        self, action: NDArray[np.float32]
-    ) -> tuple[dict[str, Floats], float, bool, bool, dict[str, Any]]:
-        """Move towards joint targets (J,), rad, for one control period.
 
-        Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
-        """
-        flat, _, terminated, truncated, info = super().step(action)
-        goals = self._as_goals(flat)
-        achieved, desired = goals["achieved_goal"], goals["desired_goal"]
-        info["is_success"] = bool(self._succeeds(achieved, desired))
-        reward = float(self.compute_reward(achieved, desired, info))
-        return goals, reward, terminated, truncated, info
+class MaraGoalVectorEnv(_GoalEnv, MaraVectorEnv):
+    """N arms with goals in one batch: it gives the same results as N MaraGoalEnvs.
 
-    def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
-        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+    Args:
+        num_envs: N.
+        task, reward_type, position_tolerance, angle_tolerance: as in MaraGoalEnv.
+        **options: as in MaraVectorEnv.
 
-        Args:
-            achieved_goal: the poses of the end effector.
-            desired_goal: the target poses.
-            info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
+    Raises:
+        GymMaraError: a name is unknown, a value is out of its range, or the task is not a reach task.
+    """
 
-        Raises:
-            GymMaraError: the task has a collision penalty, and an info has no `collided`.
-        """
-        if self.reward_type == "sparse":
-            return self._succeeds(achieved_goal, desired_goal) - 1.0
-        achieved, desired = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
-        collided = np.zeros(len(achieved), np.bool_)
-        if self.task.collision_penalty:
-            infos = [info] if isinstance(info, Mapping) else list(info)
-            if not all("collided" in one for one in infos):
-                raise GymMaraError(
-                    "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
-                )
-            collided = np.array([one["collided"] for one in infos])
-        position, quaternion = self._parts(achieved)
-        reward, _ = self.task.judge(position, quaternion, collided, Goal(*self._parts(desired)))
-        return reward.reshape(np.shape(achieved_goal)[:-1])
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str | Task = "MARARandomTarget-v0",
+        *,
+        reward_type: str = "sparse",
+        position_tolerance: float = 0.02,
+        angle_tolerance: float = 0.1,
+        **options: Any,
+    ) -> None:
+        self.closed = True  # until MaraVectorEnv has checked its arguments
+        self._goals = GoalSettings(reward_type, position_tolerance, angle_tolerance)
+        super().__init__(num_envs, task, **options)
 
-    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: an episode continues after the goal is reached."""
-        return False
-
-    def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: a goal truncates no episode."""
-        return False
-
-    def _succeeds(self, achieved: Floats, desired: Floats) -> Any:
-        away = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
-        near = away <= self.position_tolerance
-        if self.task.orientation:
-            angle = rotations.angle_between(achieved[..., 3:], desired[..., 3:])
-            near &= angle <= self.angle_tolerance
-        return near
-
-    def _parts(self, goal: Floats) -> tuple[Floats, Floats]:
-        """The positions (N, 3) and the quaternions (N, 4) of goals (N, G)."""
-        if self.task.orientation:
-            return goal[:, :3], goal[:, 3:]
-        return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
-
-    def _as_goals(self, flat: Floats) -> dict[str, Floats]:
-        """Convert the flat observation (O,) to the dictionary."""
-        values = self.simulation.observation.split(flat)
-        return {
-            name: np.concatenate([values[part.name] for part in parts])
-            for name, parts in self._groups.items()
-        }
+    def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
+        return GoalSimulation(options, num_envs, self._goals)

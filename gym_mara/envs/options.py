@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +79,22 @@ class Options:
             sensors=SensorSettings(**own["sensors"]),
             rendering=RenderSettings(**own["rendering"]),
         )
+
+
+def check_reset_options(options: Any, known: Sequence[str]) -> None:
+    """Check the keys of `reset(options=…)`.
+
+    Raises:
+        GymMaraError: one is unknown, or the options are no dictionary.
+    """
+    if not options:
+        return
+    if not isinstance(options, Mapping):
+        raise GymMaraError(f"the options of reset must be a dictionary or None, not {options!r}")
+    for key in options:
+        if key not in known:
+            valid = f"the only one is {known[0]!r}" if known else "this environment has none"
+            raise GymMaraError(f"unknown option of reset {key!r}: {valid}")
 
 
 def _names(form: Any) -> list[str]:

@@ -8,17 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
+from gym_mara.envs.actions import joint_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_vector, whole_number
+from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.types import Floats, Mask
@@ -82,8 +84,10 @@ class Simulation:
         self.observation = Observation(
             self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
         )
-        self.action_space = Box(-np.pi, np.pi, (self.robot.num_joints,), np.float32)
-        # The range of joint targets: the intersection of the action space and the joint limits, rad.
+        self.observation_space: Space[Any] = self.observation.space
+        """The space of one arm's observation in the form of `present`."""
+        self.action_space = _action_space(self.robot)
+        # The range of joint targets: the intersection of the action space and the joint limits, rad (m).
         self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
         self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
 
@@ -126,7 +130,7 @@ class Simulation:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. No arm moves then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. No arm moves then.
             ResetNeeded: the environment was not reset.
             ClosedEnvironmentError: the environment is closed.
         """
@@ -139,7 +143,7 @@ class Simulation:
         if noise is not None:
             self._sensors.measure(state.q, noise)
         observation = self._observe(state, noise)
-        reward, terms = self.task.reward(state, self.goal)
+        reward, terms = self._reward(state, observation)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
         if self.task.on_collision == "terminate":
@@ -155,6 +159,16 @@ class Simulation:
         info = {**terms, "collided": collided, **_report(state)}
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
+
+    def _reward(
+        self, state: SimState, observation: Floats
+    ) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        """The rewards (N,) of a state with its observations (N, O), and their terms."""
+        return self.task.reward(state, self.goal)
+
+    def present(self, flat: Floats) -> Any:
+        """Flat observations (…, O) in the form of the observation space."""
+        return flat
 
     def observed(self, arm: int) -> SimState:
         """The state of an arm's last observation: after a collision, the colliding state, even if the arm was reset."""
@@ -223,11 +237,8 @@ class Simulation:
         return self.observation(state, self.goal)
 
     def _target(self, action: ArrayLike) -> Floats:
-        """The joint targets of an action, clipped to the action space and the joint limits."""
-        try:
-            target = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GymMaraError(f"an action must be an array of numbers: {error}") from error
+        """The joint targets of an action, clipped to the range of joint targets."""
+        target = joint_targets(action).astype(np.float64, copy=False)
         if target.shape != self._start.shape:
             raise GymMaraError(
                 f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
@@ -271,6 +282,13 @@ class Simulation:
         if not self._closed:
             self._closed = True
             self.backend.close()
+
+
+def _action_space(robot: RobotModel) -> Box[np.float32]:
+    """The actions of the paper, ±π for every revolute joint; of a prismatic joint the whole travel, m."""
+    prismatic = robot.kinematics().prismatic
+    low, high = np.where(prismatic, robot.lower, -np.pi), np.where(prismatic, robot.upper, np.pi)
+    return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def _sensor_noise(state: SimState) -> Floats | None:

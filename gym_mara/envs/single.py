@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.envs.options import Options
+from gym_mara.envs.actions import joint_targets
+from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
+from gym_mara.envs.time_limits import TimeLimits
 from gym_mara.envs.view import view_of
 from gym_mara.errors import unknown
 from gym_mara.rendering import Pictures
@@ -60,19 +62,29 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     ) -> None:
         self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
         self._options = Options.sort(task, robot, ee_frame, backend, options)
-        self.simulation = Simulation(self._options, 1)
+        self.simulation = self._make_simulation(self._options)
         self._pictures = Pictures(self.simulation.robot, self._options.rendering)
         self.viewer: Viewer | None = None
+        self._time_limits = TimeLimits()
         # The generator from which the simulation's streams were spawned.
         self._spawned_from: np.random.Generator | None = None
-        self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
+        self.observation_space = self.simulation.observation_space
         self.action_space = self.simulation.action_space
         self.metadata = self.metadata | {"render_fps": 1.0 / self.simulation.backend.control_period}
+
+    def _make_simulation(self, options: Options) -> Simulation:
+        return Simulation(options, 1)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start configuration; `options` is not used."""
+        """Begin an episode at the start configuration.
+
+        Raises:
+            GymMaraError: `options` has a key; this environment has no options.
+        """
+        check_reset_options(options, ())
+        self._time_limits.note_reset(self)
         super().reset(seed=seed)
         if self._spawned_from is not self.np_random:
             self._spawned_from = self.np_random
@@ -80,15 +92,15 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         observation, report = self.simulation.reset()
         if self.render_mode == "human":
             self._show()
-        return observation[0], _info_of_one(report)
+        return self.simulation.present(observation[0]), _info_of_one(report)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Move towards joint targets (J,), rad, for one control period.
 
         Raises:
-            GymMaraError: the action has the wrong shape or is not finite. The arm does not move then.
+            GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
-        targets = np.asarray(action)[None]
+        targets = joint_targets(action)[None]
         # The viewer steps the simulation in real time, and may replace the targets.
         step = self.simulation.step if self.viewer is None else self.viewer.step
         outcome = step(targets)
@@ -96,7 +108,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         # At every step, because an environment does not know when Gymnasium's TimeLimit truncates its episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
-        return outcome.observation[0], outcome.reward.item(), terminated, truncated, info
+        observation = self.simulation.present(outcome.observation[0])
+        return observation, outcome.reward.item(), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """Draw the state of the last observation: uint8 (height, width, 3), RGB; None without render_mode "rgb_array".
@@ -124,12 +137,21 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return vars(self) | {"viewer": None}  # a copy opens its own viewer in reset()
 
     def save_state(self) -> dict[str, Any]:
-        """A snapshot of the arm, the episode and the random generators; it can be pickled."""
-        return self.simulation.save() | {"np_random": copy.deepcopy(self.np_random)}
+        """A snapshot of the arm, the episode and the random generators; it can be pickled.
+
+        It also has the step counts of Gymnasium's TimeLimit wrappers around this environment, but nothing else of the
+        wrappers.
+        """
+        return self.simulation.save() | {
+            "np_random": copy.deepcopy(self.np_random),
+            "time_limits": self._time_limits.counts(),
+        }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot of an environment with the same arguments."""
         self.simulation.restore(snapshot)
+        steps = int(self.simulation.statistics.steps[0])
+        self._time_limits.restore(snapshot["time_limits"], steps)
         self.np_random = copy.deepcopy(snapshot["np_random"])
         self._spawned_from = self.np_random if self.simulation.streams else None
 

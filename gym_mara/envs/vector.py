@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.envs.options import Options
+from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
@@ -60,11 +60,13 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         )
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
-            max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
+            max_episode_steps = whole_number(
+                "max_episode_steps", max_episode_steps, ", or None for no limit"
+            )
         sorted_options = Options.sort(task, robot, ee_frame, backend, options)
-        self.simulation = Simulation(sorted_options, num_envs)
+        self.simulation = self._make_simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
-        self.single_observation_space = self.simulation.observation.space
+        self.single_observation_space = self.simulation.observation_space
         self.single_action_space = self.simulation.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -77,7 +79,12 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         }
         self._pictures = Pictures(self.simulation.robot, sorted_options.rendering)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        # A copy of the last observations (N, O), which a reset with a mask returns for the other arms.
+        self._last: Floats | None = None
         self.closed = False
+
+    def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
+        return Simulation(options, num_envs)
 
     def reset(
         self,
@@ -87,9 +94,12 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin episodes of all arms, or of the arms that `options["reset_mask"]`, bool (N,), selects.
 
+        The other arms keep their last observation.
+
         Raises:
-            GymMaraError: the number of seeds is not N, or the mask is not valid.
+            GymMaraError: the number of seeds is not N, the mask is not valid, or `options` has another key.
         """
+        check_reset_options(options, ["reset_mask"])
         seeds: Sequence[int | None] = [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + index for index in range(self.num_envs)]
@@ -112,7 +122,10 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         if self.simulation.random:
             self._seed(seeds, chosen)
         observation, report = self.simulation.reset(mask)
-        return observation, _vector_info(report, chosen)
+        if mask is not None and self._last is not None:
+            observation = np.where(mask[:, None], observation, self._last)
+        self._last = observation.copy()
+        return self.simulation.present(observation), _vector_info(report, chosen)
 
     def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
         """Set the streams of each arm to those of a MaraEnv with the arm's seed."""
@@ -126,7 +139,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """Move every arm towards its joint targets (N, J), rad, for one control period.
 
         Raises:
-            GymMaraError: the actions have the wrong shape or are not finite, or an ended episode was not reset. No arm
+            GymMaraError: the actions have the wrong type or shape, or are not finite, or an ended episode was not reset. No arm
                 moves then.
         """
         resetting = self._ended
@@ -137,7 +150,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             )
         outcome = self.simulation.step(actions)
         observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
-        truncated = self.simulation.statistics.steps == self.max_episode_steps
+        limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
+        truncated = self.simulation.statistics.steps >= limit
         if outcome.truncated is not None:
             truncated |= outcome.truncated
         stepped = ~resetting
@@ -156,7 +170,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 observation, info = self._begin_next(outcome, info, ended)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended.copy()
-        return observation, reward, terminated, truncated, info
+        self._last = observation.copy()
+        return self.simulation.present(observation), reward, terminated, truncated, info
 
     def _begin_next(
         self, outcome: Outcome, final: dict[str, Any], ended: Mask
@@ -173,7 +188,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """
         last = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended):
-            last[index] = outcome.observation[index].copy()
+            last[index] = self.simulation.present(outcome.observation[index].copy())
         info = _vector_info(outcome.info, ~ended)
         info |= {"final_obs": last, "_final_obs": ended}
         final = {key: value for key, value in final.items() if key[0] != "_"}
@@ -197,6 +212,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """A snapshot of the arms, the episodes and the random generators; it can be pickled."""
         return self.simulation.save() | {
             "ended": self._ended.copy(),
+            "last": copy.copy(self._last),
             "np_random": copy.deepcopy(self.np_random),
         }
 
@@ -204,6 +220,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         """Restore a snapshot of an environment with the same arguments."""
         self.simulation.restore(snapshot)
         self._ended = snapshot["ended"].copy()
+        self._last = copy.copy(snapshot["last"])
         self.np_random = copy.deepcopy(snapshot["np_random"])
 
     def close_extras(self, **kwargs: Any) -> None:

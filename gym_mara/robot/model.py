@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import pinocchio as pin
@@ -78,7 +78,7 @@ class RobotModel:
             raise GymMaraError(
                 f"robot must be a name, the path of a URDF, a list of modules or a RobotModel, not {robot!r}"
             )
-        if isinstance(robot, Path) or robot.endswith((".urdf", ".xml")):
+        if isinstance(robot, Path) or is_path(robot):
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")
             return cls.from_urdf(path, ee_frame, srdf if srdf.is_file() else None)
@@ -278,6 +278,11 @@ class RobotModel:
 
     def __repr__(self) -> str:
         return f"RobotModel({self.name!r}, joints={list(self.joint_names)}, ee_frame={self.ee_frame!r})"
+
+
+def is_path(robot: object) -> TypeGuard[str | Path]:
+    """Whether a robot is given by the path of its URDF."""
+    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))
 
 
 RobotLike = str | Sequence[str] | RobotModel

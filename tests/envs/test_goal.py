@@ -8,16 +8,21 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from gym_mara.envs import MaraEnv, MaraVectorEnv
-from gym_mara.envs.goal import MaraGoalEnv
+from gym_mara.envs.goal import MaraGoalEnv, MaraGoalVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
+from gym_mara.state import SimState
+from gym_mara.tasks import Goal, Part, Task, Workspace, observation
 from gym_mara.testing import COLLIDING_Q, COPIES
+from gym_mara.types import Floats
 from tests.helpers import TARGET_Q, robot_model
 
 RANDOM = "MARARandomTarget-v0"
@@ -108,7 +113,7 @@ OPTIONS: list[dict[str, Any]] = [
 def test_compute_reward_gives_the_rewards_of_the_steps(
     options: dict[str, Any], data: st.DataObject
 ) -> None:
-    env = MaraGoalEnv(**options)
+    env: Any = MaraGoalEnv(**options)
     env.reset(seed=data.draw(st.integers(0, 1000)))
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
     steps = [env.step(rng.uniform(-2.0, 2.0, 6).astype(np.float32)) for _ in range(4)]
@@ -125,7 +130,7 @@ def test_compute_reward_gives_the_rewards_of_the_steps(
 
 
 def test_reaching_the_goal_is_a_success() -> None:
-    env = MaraGoalEnv("MARAOrient-v0")
+    env: Any = MaraGoalEnv("MARAOrient-v0")
     env.reset()
     observation, reward, *_, info = env.step(np.array(TARGET_Q, np.float32))
     assert reward == 0.0
@@ -177,7 +182,99 @@ def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> N
 
 
 def test_a_collision_penalty_without_infos_is_an_error() -> None:
-    env = MaraGoalEnv(reward_type="dense", collision_penalty=True)
+    env: Any = MaraGoalEnv(reward_type="dense", collision_penalty=True)
     observation, _ = env.reset(seed=0)
     with pytest.raises(GymMaraError, match="copy_info_dict"):
         env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
+
+
+# The vector environment.
+
+
+def _assert_same(mine: Any, theirs: Any) -> None:
+    """Both are equal: dictionaries, arrays of dictionaries and of numbers. Statistics are those of the last step only."""
+    if isinstance(theirs, dict):
+        for key in theirs.keys() - {"statistics", "_statistics"}:
+            _assert_same(mine[key], theirs[key])
+    elif theirs.dtype == object:
+        for one, other in zip(mine, theirs, strict=True):
+            if isinstance(other, dict):
+                _assert_same(one, other)
+            else:
+                assert one is other is None
+    else:
+        np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize("options", OPTIONS)
+def test_goal_environments_in_a_batch_give_the_results_of_single_ones(
+    options: dict[str, Any], mode: str
+) -> None:
+    native: Any = gymnasium.make_vec(
+        "gym_mara/MARAGoal-v0", num_envs=3, autoreset_mode=mode, max_episode_steps=4, **options
+    )
+    assert type(native) is MaraGoalVectorEnv
+    singles: Any = gymnasium.make_vec(
+        "gym_mara/MARAGoal-v0",
+        num_envs=3,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode(mode)},
+        max_episode_steps=4,
+        **options,
+    )
+    assert native.observation_space == singles.observation_space
+    assert native.single_observation_space == singles.single_observation_space
+    _assert_same(native.reset(seed=5)[0], singles.reset(seed=5)[0])
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(12):
+        actions = rng.uniform(-2.0, 2.0, (3, 6))
+        mine, theirs = native.step(actions), singles.step(actions)
+        for one, other in zip(mine, theirs, strict=True):
+            _assert_same(one, other)
+        assert native.observation_space.contains(mine[0])
+        ended = mine[2] | mine[3]
+        ends += int(ended.sum())
+        if mode == "Disabled" and ended.any():
+            mask = np.array([True, False, True])
+            for envs in (native, singles):
+                envs.reset(options={"reset_mask": ended})
+            first, expected = (e.reset(options={"reset_mask": mask})[0] for e in (native, singles))
+            _assert_same(first, expected)
+    assert ends
+
+
+def test_the_vector_environment_computes_rewards_for_other_goals() -> None:
+    envs = MaraGoalVectorEnv(4, reward_type="dense")
+    envs.reset(seed=0)
+    observation: Any
+    observation, reward, *_ = envs.step(np.zeros((4, 6)))
+    again = envs.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
+    np.testing.assert_allclose(again, reward, rtol=0.0, atol=1e-12)
+    success = envs.compute_reward(observation["achieved_goal"], observation["achieved_goal"], {})
+    assert (success > reward).all()
+
+
+def test_the_statistics_are_of_the_rewards_that_the_agent_receives() -> None:
+    env: Any = MaraGoalEnv()
+    env.reset(seed=0)
+    assert env.step(np.zeros(6, np.float32))[4]["statistics"]["ep_rew_mean"] == -1.0
+
+
+class StillTask(Task):
+    """A task that is no reach task."""
+
+    def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
+        return Goal(np.zeros((num_envs, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)))
+
+    def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> list[Part]:
+        return [observation.joint_positions(robot)]
+
+    def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
+        return np.zeros(len(state.q)), {}
+
+
+@pytest.mark.parametrize("make", [MaraGoalEnv, MaraGoalVectorEnv])
+def test_another_task_than_a_reach_task_is_refused(make: Any) -> None:
+    with pytest.raises(GymMaraError, match="needs a reach task"):
+        make(task=StillTask())

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
@@ -65,7 +66,7 @@ def test_the_checkers_only_warn_of_the_action_space(
 ) -> None:
     check(gymnasium.make(name).unwrapped)
     assert all("symmetric and normalized" in message for message in _messages(recwarn))
-    assert len(recwarn) == 1, "the only warning is that of the prescribed Box(-π, π)"
+    assert len(recwarn) == 1, "the only warning is that the actions are joint targets"
 
 
 @pytest.mark.filterwarnings("always")
@@ -91,9 +92,35 @@ def test_an_episode_in_the_default_wrappers_gives_no_warning(name: str) -> None:
 # Spaces.
 
 
-def test_the_action_space_is_the_prescribed_one() -> None:
-    space = MaraEnv().action_space
-    assert space == gymnasium.spaces.Box(-np.pi, np.pi, (6,), np.float32)
+@pytest.mark.parametrize("robot", ["mara", "ur5", "panda", "so100"])
+def test_the_action_space_is_that_of_the_paper(robot: str) -> None:
+    space = MaraEnv(robot=robot_model(robot)).action_space
+    assert space == gymnasium.spaces.Box(-np.pi, np.pi, space.shape, np.float32)
+
+
+def test_the_action_space_spans_the_whole_travel_of_a_prismatic_joint(tmp_path: Path) -> None:
+    rail = joint_xml(0, "prismatic", limit='<limit lower="-1" upper="5" effort="9" velocity="1"/>')
+    path = write(tmp_path / "rail.urdf", urdf_xml(rail, joint_xml(1), joint_xml(2)))
+    env = MaraEnv(robot=str(path), ee_frame="link3", on_collision="continue")
+    assert env.simulation.action_space.high[0] == 5.0
+    env.reset()
+    assert env.step(np.array([4.5, 0.0, 0.0], np.float32))[0][0] == 4.5
+
+
+@pytest.mark.parametrize("robot", ["mara", "ur5", "panda", "so100"])
+def test_rescaled_actions_give_the_targets_of_the_batch_for_stable_baselines3(robot: str) -> None:
+    env = MaraEnv(robot=robot_model(robot), on_collision="continue")
+    rescaled = RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+    arms = MaraVectorEnv(1, robot=robot_model(robot), autoreset_mode="SameStep")
+    batch: Any = MaraVecEnv(arms, rescaled.action_space)  # type: ignore[arg-type]
+    rescaled.reset()
+    joints, rng = env.simulation.robot.num_joints, np.random.default_rng(0)
+    for action in [*rng.uniform(-1.0, 1.0, (20, joints)), np.ones(joints), -np.ones(joints)]:
+        action = action.astype(np.float32)
+        q = rescaled.step(action)[0][:joints]
+        simulation = env.simulation
+        target = batch.targets(action[None])[0].clip(simulation.target_low, simulation.target_high)
+        np.testing.assert_allclose(q, target, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
@@ -132,7 +159,7 @@ def test_any_finite_action_keeps_the_observation_in_its_space(
 
 
 @given(arrays(np.float64, 6, elements=st.floats(-1e300, 1e300)))
-def test_an_action_is_clipped_to_the_action_space_and_the_joint_limits(action: Any) -> None:
+def test_an_action_is_clipped_to_the_joint_limits_within_one_turn(action: Any) -> None:
     env = MaraEnv(on_collision="continue")
     env.reset()
     limit = np.minimum([3.1416, 2.35, 2.61, 3.14, 2.56, 3.14], np.float32(np.pi))
@@ -398,7 +425,7 @@ def test_constants_of_the_reward_are_keyword_arguments() -> None:
         (np.array([0.1] * 5 + [np.nan]), "the action contains NaN or infinity; joint targets must"),
         (np.array([0.1] * 5 + [np.inf]), "the action contains NaN or infinity"),
         (np.array([0.1] * 5 + [-np.inf]), "the action contains NaN or infinity"),
-        (["a"] * 6, "an action must be an array of numbers"),
+        (["a"] * 6, "an action must be an array of integers or floats"),
         (None, r"the action has shape \(\)|an action must be"),
     ],
 )

@@ -312,6 +312,87 @@ def test_an_invalid_reset_mask_is_refused(mask: Any) -> None:
         env.reset(options={"reset_mask": mask})
 
 
+NOISY: dict[str, Any] = {"backend": "dart", "randomisation": {"sensor_noise": (0.05, 0.05)}}
+INTO_THE_TABLE = np.array([[0.0] * 6, [0.0, 2.3, 2.6, 0.0, 0.0, 0.0], [0.3] * 6], np.float32)
+
+
+@pytest.mark.parametrize("mode", ["Disabled", *MODES])
+@pytest.mark.parametrize("options", [{}, NOISY, {"on_collision": "continue"}])
+def test_a_reset_with_a_mask_returns_the_last_observation_of_the_other_arms(
+    mode: str, options: dict[str, Any]
+) -> None:
+    native, singles = _pair("gym_mara/MARARandomTarget-v0", 3, mode, **options)
+    mask = np.array([True, False, False])
+    native.reset(seed=0)
+    singles.reset(seed=0)
+    for _ in range(2):
+        last, *_, info = native.step(INTO_THE_TABLE)
+        assert info["collided"][1] or options is NOISY
+        kept = last.copy()
+        last[:] = np.nan  # the user's own array
+        singles.step(INTO_THE_TABLE)
+        for _ in range(2):
+            mine, info = native.reset(options={"reset_mask": mask})
+            theirs, expected = singles.reset(options={"reset_mask": mask.copy()})
+            np.testing.assert_array_equal(mine[1:], kept[1:])
+            np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-12)
+            _assert_same_info(info, expected)
+    next_step, its_step = native.step(INTO_THE_TABLE), singles.step(INTO_THE_TABLE)
+    np.testing.assert_allclose(next_step[0], its_step[0], rtol=0.0, atol=1e-12)
+    _assert_same_info(next_step[4], its_step[4])
+    native.close()
+    singles.close()
+
+
+def test_a_snapshot_holds_the_last_observations() -> None:
+    env = MaraVectorEnv(3, autoreset_mode="Disabled")
+    env.reset()
+    last = env.step(INTO_THE_TABLE)[0]
+    snapshot = pickled(env.save_state())
+    env.reset()
+    env.restore_state(snapshot)
+    after, _ = env.reset(options={"reset_mask": np.array([True, False, False])})
+    np.testing.assert_array_equal(after[1:], last[1:])
+
+
+def test_a_limit_below_the_steps_of_an_episode_truncates_it() -> None:
+    env = MaraVectorEnv(2, max_episode_steps=100)
+    env.reset()
+    for _ in range(5):
+        assert not env.step(np.zeros((2, 6)))[3].any()
+    env.max_episode_steps = 3
+    assert env.step(np.zeros((2, 6)))[3].all()
+
+
+@pytest.mark.parametrize("options", [{"mask": None}, {"reset_masks": np.ones(2, np.bool_)}])
+def test_an_unknown_option_of_reset_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(
+        GymMaraError, match=r"unknown option of reset 'mask|the only one is 'reset_mask'"
+    ):
+        MaraVectorEnv(2).reset(options=options)
+    with pytest.raises(GymMaraError, match="this environment has none"):
+        MaraEnv().reset(options=options)
+
+
+def test_options_of_another_type_are_refused() -> None:
+    with pytest.raises(GymMaraError, match="must be a dictionary or None"):
+        MaraEnv().reset(options=["seed"])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_wrappers_that_pass_options_work(mode: str) -> None:
+    envs = gymnasium.make_vec(
+        "gym_mara/MARA-v0",
+        num_envs=2,
+        vectorization_mode=mode,
+        vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+    )
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
+    envs.reset(seed=0, options={})
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.close()
+
+
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "two", None])
 def test_an_invalid_number_of_envs_is_refused(count: Any) -> None:
     with pytest.raises(
@@ -327,7 +408,7 @@ def test_num_envs_can_be_a_numpy_integer() -> None:
 
 @pytest.mark.parametrize("steps", [0, -3, 2.5, True])
 def test_an_invalid_max_episode_steps_is_refused(steps: Any) -> None:
-    with pytest.raises(GymMaraError, match="max_episode_steps must be"):
+    with pytest.raises(GymMaraError, match=r"max_episode_steps must be .*or None for no limit"):
         MaraVectorEnv(1, max_episode_steps=steps)
 
 

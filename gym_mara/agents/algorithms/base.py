@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 
-from gym_mara.errors import unknown
+from gym_mara.errors import GymMaraError, unknown
+from gym_mara.files import short
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
     from stable_baselines3.common.policies import ActorCriticPolicy
 
 POLICY_FORMS = {
-    "mlp": "stable_baselines3.common.policies:ActorCriticPolicy",
+    "mlp": "gym_mara.agents.algorithms.unit_policy:MlpPolicy",
     "natural": "gym_mara.agents.algorithms.natural_gaussian:NaturalGaussianPolicy",
 }
 """The policy networks by name, each as "module:Class", imported when first used."""
@@ -36,8 +38,10 @@ class Preset:
     """Hyperparameters of an algorithm: how many arms it trains on, what is normalised, and its arguments.
 
     Raises:
-        GymMaraError: the policy is not one of POLICY_FORMS.
+        GymMaraError: the policy is not one of POLICY_FORMS, or a value is unknown or out of its range.
     """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     num_envs: int
     policy: str = "mlp"
@@ -54,6 +58,94 @@ class Preset:
     def __post_init__(self) -> None:
         if self.policy not in POLICY_FORMS:
             raise unknown("policy", self.policy, POLICY_FORMS)
+        steps = self.arguments.get("n_steps", 1)
+        if type(steps) is not int or steps < 1:
+            raise GymMaraError(f"n_steps must be a whole number of at least 1, not {short(steps)}")
+        if not 1 <= self.num_envs <= _MOST_ARMS or self.num_envs * steps > _LARGEST_ROLLOUT:
+            raise GymMaraError(
+                f"a preset has 1 to {_MOST_ARMS} arms, and at most {_LARGEST_ROLLOUT} steps in a rollout, "
+                f"not {short(self.num_envs)} arms with {short(steps)} steps each"
+            )
+        policy = self.arguments.get("policy_kwargs", {})
+        others = {name: v for name, v in self.arguments.items() if name != "policy_kwargs"}
+        for name, value in others.items():
+            points = value if is_schedule(value) else [(0.0, value)]
+            if any(len(point) != 2 for point in points) or not all(
+                _is_number(number) or number is None for point in points for number in point
+            ):
+                raise GymMaraError(
+                    f"the argument {name!r} must be a number or points (progress, value), not {short(value)}"
+                )
+        _check_policy(policy)
+
+
+_MOST_ARMS = 2**16
+_LARGEST_ROLLOUT = 2**22
+_LARGEST_WHOLE = 10**12
+_NETWORK = (6, 1024)
+"""The most layers of a network, and the most units of a layer."""
+_POLICY_NUMBERS = ("log_std_init", "ortho_init", "covariance_rate", "bias_rate", "widening")
+
+
+def _check_policy(values: Any) -> None:
+    """Raises GymMaraError if the arguments of a policy network are not valid."""
+    if not isinstance(values, dict):
+        raise GymMaraError(f"policy_kwargs must be a dict, not {short(values)}")
+    layers, units = _NETWORK
+    for name, value in values.items():
+        if name == "net_arch":
+            nets = list(value.values()) if isinstance(value, dict) else [value]
+            if (isinstance(value, dict) and set(value) - {"pi", "vf"}) or not all(
+                isinstance(net, (list, tuple))
+                and len(net) <= layers
+                and all(type(size) is int and 1 <= size <= units for size in net)
+                for net in nets
+            ):
+                raise GymMaraError(
+                    f"net_arch must be a list of at most {layers} sizes from 1 to {units}, or such lists "
+                    f"by the names 'pi' and 'vf', not {short(value)}"
+                )
+        elif name == "optimizer_class":
+            if not isinstance(value, str) or not value.isidentifier():
+                raise GymMaraError(
+                    f"optimizer_class must be the name of an optimiser, not {short(value)}"
+                )
+        elif name not in _POLICY_NUMBERS:
+            valid = ["net_arch", "optimizer_class", *_POLICY_NUMBERS]
+            raise unknown("argument of the policy", name, valid)
+        elif not _is_number(value):
+            raise GymMaraError(f"{name} must be a finite number, not {short(value)}")
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, int):
+        return abs(value) <= _LARGEST_WHOLE
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def plain_values(name: str, value: Any, depth: int = 0) -> None:
+    """Check that a value can stand in a run's configuration: texts, finite numbers, lists and dicts of them.
+
+    Raises:
+        GymMaraError: it cannot.
+    """
+    if isinstance(value, dict) and depth < _DEEPEST:
+        for key, each in value.items():
+            if not isinstance(key, str):
+                raise GymMaraError(f"{name} has the key {short(key)}; keys must be texts")
+            plain_values(f"{name}[{key!r}]", each, depth + 1)
+    elif isinstance(value, (list, tuple)) and depth < _DEEPEST:
+        for each in value:
+            plain_values(name, each, depth + 1)
+    elif not (value is None or isinstance(value, str) or _is_number(value)):
+        raise GymMaraError(
+            f"{name} must consist of texts, finite numbers, lists and dicts, so that a run can store it; "
+            f"it has {short(value)}"
+        )
+
+
+_DEEPEST = 8
+"""The most levels of nested lists and dicts."""
 
 
 def is_schedule(value: Any) -> TypeGuard[Sequence[Sequence[float]]]:

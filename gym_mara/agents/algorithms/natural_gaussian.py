@@ -21,6 +21,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
 
+from gym_mara.agents.algorithms.unit_policy import MarksUnitActions
 from gym_mara.errors import GymMaraError
 
 # The lower bound of standard deviations. Actions are float32 of order 1, and cannot resolve much smaller ones. The bound in
@@ -84,7 +85,7 @@ class NaturalGaussian(Distribution):
         return actions, self.log_prob(actions)
 
 
-class NaturalGaussianPolicy(ActorCriticPolicy):
+class NaturalGaussianPolicy(MarksUnitActions, ActorCriticPolicy):
     """The ActorCriticPolicy of Stable-Baselines3 with a NaturalGaussian, for box actions.
 
     Before each update, the centre moves to the average of the rollout's means, and the factor absorbs the learnt change of the

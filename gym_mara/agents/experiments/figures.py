@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -12,11 +13,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, StrMethodFormatter
 from scipy.stats import bootstrap, trim_mean
 
-from gym_mara.agents.experiments.grid import Grid, read_grid, read_result
+from gym_mara.agents.experiments.grid import Grid, Result, read_grid, read_result
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
+from gym_mara.files import write_text, written_aside
 from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
 from gym_mara.types import Floats
 
@@ -33,6 +36,8 @@ COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
 }
 _TRAINING, _EVALUATION = "rollout/reward_per_step", "eval/reward_per_step"
 _POINTS = 200
+_BEST = 10.0 * MAX_EPISODE_STEPS
+"""The highest reward of an episode."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +71,23 @@ def plot_grid(folder: Path) -> list[Path]:
     """Draw the figures of a grid into its folder, with its table and curves; returns the files.
 
     For each environment there is a figure of all algorithms, ENV.png, and one of each algorithm alone, ENV_ALGO.png. The
-    tables are `table.md`, `table.csv` and `curves.csv`. Runs that have not finished are left out.
+    tables are `table.md`, `table.csv` and `curves.csv`. Runs that have not finished are left out. A file is replaced when
+    its successor is complete.
 
     Raises:
-        GymMaraError: the folder holds no grid, or none of its runs has finished.
+        GymMaraError: the folder holds no grid, none of its runs has finished, a finished run is damaged, or a file cannot
+            be written.
     """
     grid = read_grid(folder)
-    results = {
-        name: result for name in grid.runs() if (result := read_result(folder / name)) is not None
-    }
+    runs = grid.runs()
+    results = {name: result for name in runs if (result := read_result(folder / name)) is not None}
     if not results:
         raise GymMaraError(f"no run of the grid {str(folder)!r} has finished")
     curves = {name: _curve(folder / name) for name in results}
     files = []
     for env in grid.envs:
-        runs = [grid.runs()[name] for name in results]
-        finished = [a for a in grid.algos if any((r.env, r.algo) == (env, a) for r in runs)]
+        of_env = {runs[name].algo for name in results if runs[name].env == env}
+        finished = [algo for algo in grid.algos if algo in of_env]
         if finished:
             files.append(_draw(folder / f"{env}.png", grid, env, grid.algos, curves))
         for algo in finished:
@@ -89,7 +95,7 @@ def plot_grid(folder: Path) -> list[Path]:
     files.append(_write_curves(folder / "curves.csv", grid, curves))
     rows = list(_rows(grid, results))
     files.append(_write_table(folder / "table.csv", rows))
-    (folder / "table.md").write_text(_markdown(rows))
+    write_text(folder / "table.md", _markdown(rows))
     return [*files, folder / "table.md"]
 
 
@@ -104,7 +110,7 @@ def _curve(path: Path) -> list[dict[str, float]]:
         if any(_TRAINING in row for row in rows):
             return rows
         raise DamagedRunError("it holds no training rewards")
-    except (OSError, DamagedRunError) as error:
+    except (OSError, GymMaraError) as error:
         raise DamagedRunError(
             f"the finished run {str(path)!r} is damaged: progress.csv: {error}; "
             "move the folder away and run the same benchmark command to train it again"
@@ -122,30 +128,26 @@ def _draw(
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axis = figure.subplots()
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
+    drawn = []
     for algo in algos:
         names = [name for name, run in grid.runs().items() if (run.env, run.algo) == (env, algo)]
         lines = [_episode_reward(curves[name], steps) for name in names if name in curves]
         if lines:
-            _draw_band(
-                axis, steps, np.array(lines), algo, f"C{grid.algos.index(algo)}", len(algos) == 1
-            )
-    axis.axhline(10.0 * MAX_EPISODE_STEPS, color="grey", linewidth=0.8, linestyle=":")
+            colour = f"C{grid.algos.index(algo)}"
+            drawn.append(_draw_band(axis, steps, np.array(lines), algo, colour, len(algos) == 1))
+    axis.set_ylabel("mean episode reward in training" + _scale(axis, np.concatenate(drawn)))
     axis.set_xlabel("environment steps")
-    axis.set_ylabel("mean episode reward in training")
     axis.set_title(f"{env}, {grid.preset_name} presets, {grid.backend}")
     axis.legend(loc="best")
-    figure.savefig(file, dpi=110)
+    with written_aside(file) as aside:
+        figure.savefig(aside, dpi=110)
     return file
 
 
 def _draw_band(
-    axis: Axes,
-    steps: Floats,
-    lines: Floats,
-    algo: str,
-    colour: str,
-    alone: bool,
-) -> None:
+    axis: Axes, steps: Floats, lines: Floats, algo: str, colour: str, alone: bool
+) -> Floats:
+    """Draw the mean and the deviation of the lines of some seeds; returns what the axis must show."""
     mean, deviation = lines.mean(axis=0), lines.std(axis=0)
     of = f"mean and deviation of {len(lines)} seeds" if len(lines) > 1 else "one seed"
     axis.plot(steps, mean, color=colour, label=f"{algo.upper()}, {of}")
@@ -155,6 +157,36 @@ def _draw_band(
     if alone:
         for line in lines:
             axis.plot(steps, line, color=colour, linewidth=0.5, alpha=0.6)
+    return lines.ravel() if alone else mean
+
+
+def _scale(axis: Axes, shown: Floats) -> str:
+    """Scale the axis of rewards so that curves close to the best can be told apart; returns what to add to its label.
+
+    The distance from the best is logarithmic where it spans more than one decade.
+    """
+    distance = np.array([_BEST - shown.max(), _BEST - shown.min()])
+    if not 0.0 < 10.0 * distance[0] < distance[1]:
+        return ""
+    least, most = distance * [0.8, 1.25]
+
+    def forward(reward: Floats) -> Floats:
+        return -np.log10(np.maximum(_BEST - reward, least / 10.0))
+
+    def inverse(scaled: Floats) -> Floats:
+        rewards: Floats = _BEST - 10.0**-scaled
+        return rewards
+
+    axis.set_yscale("function", functions=(forward, inverse))
+    axis.set_ylim(_BEST - most, _BEST - least)
+    decades = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)))
+    axis.yaxis.set_major_locator(FixedLocator(list(_BEST - decades)))
+    axis.yaxis.set_minor_locator(
+        FixedLocator(list(_BEST - np.outer(decades, range(2, 10)).ravel()))
+    )
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:,.10g}"))
+    axis.grid(axis="y", alpha=0.3)
+    return f",\nlogarithmic in the distance from {_BEST:,.0f}, the best"
 
 
 def _episode_reward(rows: list[dict[str, float]], steps: Floats) -> Floats:
@@ -173,26 +205,28 @@ def _write_curves(file: Path, grid: Grid, curves: dict[str, list[dict[str, float
     """Write all curves, sampled at the same steps, and the results of the evaluations during training."""
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
     evaluated = (_EVALUATION, "eval/position_error_mm", "eval/angle_deg")
-    with file.open("w", newline="") as stream:
-        table = csv.writer(stream)
-        table.writerow(["env", "algo", "seed", "steps", _TRAINING, *evaluated])
-        for name, run in grid.runs().items():
-            rows = curves.get(name, [])
-            for step, reward in zip(
-                steps, _episode_reward(rows, steps) if rows else (), strict=False
-            ):
-                cells = [f"{int(step)}", f"{reward / MAX_EPISODE_STEPS:.4f}"]
-                table.writerow([run.env, run.algo, run.seed, *cells, "", "", ""])
-            for row in rows:
-                if _EVALUATION in row:
-                    cells = [f"{row[column]:.5g}" for column in evaluated]
-                    table.writerow(
-                        [run.env, run.algo, run.seed, row["time/total_timesteps"], "", *cells]
-                    )
+    table: list[list[Any]] = [["env", "algo", "seed", "steps", _TRAINING, *evaluated]]
+    for name, run in grid.runs().items():
+        rows = curves.get(name, [])
+        start = [run.env, run.algo, run.seed]
+        for step, reward in zip(steps, _episode_reward(rows, steps) if rows else (), strict=False):
+            cells = [f"{int(step)}", f"{reward / MAX_EPISODE_STEPS:.4f}"]
+            table.append([*start, *cells, "", "", ""])
+        for row in rows:
+            if _EVALUATION in row:
+                cells = [f"{row[column]:.5g}" if column in row else "" for column in evaluated]
+                table.append([*start, row["time/total_timesteps"], "", *cells])
+    return _write_csv(file, table)
+
+
+def _write_csv(file: Path, table: list[list[Any]]) -> Path:
+    text = io.StringIO()
+    csv.writer(text).writerows(table)
+    write_text(file, text.getvalue())
     return file
 
 
-def _rows(grid: Grid, results: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def _rows(grid: Grid, results: dict[str, Result]) -> Iterator[dict[str, Any]]:
     """A row for each environment and algorithm."""
     for env in grid.envs:
         for algo in grid.algos:
@@ -212,7 +246,7 @@ def _rows(grid: Grid, results: dict[str, dict[str, Any]]) -> Iterator[dict[str, 
             yield row
 
 
-def _value(result: dict[str, Any], path: tuple[str, ...]) -> float:
+def _value(result: Result, path: tuple[str, ...]) -> float:
     value: Any = result
     for key in path:
         value = value[key]
@@ -220,14 +254,12 @@ def _value(result: dict[str, Any], path: tuple[str, ...]) -> float:
 
 
 def _write_table(file: Path, rows: list[dict[str, Any]]) -> Path:
-    with file.open("w", newline="") as stream:
-        table = csv.writer(stream)
-        titles = [f"{title}, {part}" for title in COLUMNS for part in ("iqm", "low", "high")]
-        table.writerow(["environment", "algorithm", "seeds", *titles])
-        for row in rows:
-            cells = [f"{v:.6g}" for title in COLUMNS for v in asdict(row[title][0]).values()]
-            table.writerow([row["environment"], row["algorithm"], row["seeds"], *cells])
-    return file
+    titles = [f"{title}, {part}" for title in COLUMNS for part in ("iqm", "low", "high")]
+    table: list[list[Any]] = [["environment", "algorithm", "seeds", *titles]]
+    for row in rows:
+        cells = [f"{v:.6g}" for title in COLUMNS for v in asdict(row[title][0]).values()]
+        table.append([row["environment"], row["algorithm"], row["seeds"], *cells])
+    return _write_csv(file, table)
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:

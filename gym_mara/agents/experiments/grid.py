@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, cast
 
-from filelock import FileLock, Timeout
+from annotated_types import Ge, MaxLen
+from pydantic import ConfigDict, FiniteFloat
+from typing_extensions import TypedDict
 
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import Executor, OnMessage, Send
@@ -21,12 +24,20 @@ from gym_mara.agents.runs.folder import (
     RunConfig,
     RunFolder,
     read_progress,
-    write_atomically,
 )
 from gym_mara.agents.training.callbacks import OnProgress
 from gym_mara.agents.training.train import resume, train
 from gym_mara.backends import DEFAULT_BACKEND, backend_names
 from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.files import (
+    DamagedFileError,
+    MissingFileError,
+    locked,
+    read_json,
+    short,
+    write_json,
+    writing,
+)
 from gym_mara.tasks import TASKS
 
 _TRAINING = "rollout/reward_per_step"
@@ -34,23 +45,26 @@ PATIENCE = 30.0
 """How long to wait for another process that trains the same run, s; for example one whose parent was just killed."""
 REACHED = 10.0
 """A run has learnt to reach once its deterministic policy ends an episode within this distance of the target, mm."""
+MOST_SEEDS, MOST_STEPS = 1000, 10**10
+_Name = Annotated[str, MaxLen(100)]
+_Length = Annotated[FiniteFloat, Ge(0.0)]
 
 
 @dataclass(frozen=True)
 class Grid:
     """What to train: every algorithm on every environment with every seed."""
 
-    envs: tuple[str, ...]
-    algos: tuple[str, ...]
+    envs: tuple[_Name, ...]
+    algos: tuple[_Name, ...]
     seeds: int
     """The number of runs of each pair, with the seeds 0, 1, …"""
     steps: int
-    preset_name: str = DEFAULT_PRESET
-    backend: str = DEFAULT_BACKEND
+    preset_name: _Name = DEFAULT_PRESET
+    backend: _Name = DEFAULT_BACKEND
     checkpoint_every: int = 50_000
 
     def check(self) -> None:
-        """Raises GymMaraError if a name is unknown or given twice, or a number is out of range."""
+        """Raises GymMaraError if a name is missing, unknown or given twice, or a number is out of range."""
         for env in self.envs:
             if env not in TASKS:
                 raise unknown("environment", env, TASKS)
@@ -58,11 +72,18 @@ class Grid:
             algorithm(algo).preset_pair(self.preset_name)
         if self.backend not in backend_names():
             raise unknown("backend", self.backend, backend_names())
-        for names in (self.envs, self.algos):
+        for kind, names in (("environment", self.envs), ("algorithm", self.algos)):
+            if not names:
+                raise GymMaraError(f"a grid needs at least one {kind}")
             if len(set(names)) < len(names):
                 raise GymMaraError(f"{', '.join(names)}: give each name once")
-        for name in ("seeds", "steps", "checkpoint_every"):
-            whole_number(name, getattr(self, name))
+        for name, most in (
+            ("seeds", MOST_SEEDS),
+            ("steps", MOST_STEPS),
+            ("checkpoint_every", MOST_STEPS),
+        ):
+            if whole_number(name, value := getattr(self, name)) > most:
+                raise GymMaraError(f"{name} must be at most {most:,}, not {short(value)}")
 
     def runs(self) -> dict[str, RunConfig]:
         """Name → run."""
@@ -82,6 +103,37 @@ class Grid:
         }
 
 
+@dataclass(frozen=True)
+class _GridFile(Grid):
+    """The content of grid.json."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    presets: dict[_Name, tuple[dict[str, Any], ...]] = field(kw_only=True)
+    """Algorithm → its presets when the grid was started."""
+
+
+Metrics = TypedDict(
+    "Metrics",
+    {
+        "position_error_mm": _Length | None,
+        "angle_deg": _Length | None,
+        "reward_per_step": FiniteFloat,
+        "return": FiniteFloat,
+        "collisions": _Length,
+    },
+)
+"""How a policy did; None for what its task does not measure."""
+
+
+class Result(TypedDict):
+    """The result of a finished run, the content of result.json."""
+
+    last: Metrics
+    best: Metrics
+    steps_to_10_mm: Annotated[int, Ge(0)] | None
+    seconds: _Length
+
+
 def open_grid(folder: Path, grid: Grid) -> None:
     """Make the folder of a grid, or check that an existing folder holds this grid.
 
@@ -90,16 +142,14 @@ def open_grid(folder: Path, grid: Grid) -> None:
     """
     grid.check()
     file = folder / "grid.json"
-    if file.is_file():
-        existing, presets = _read(folder)
+    if os.path.lexists(file):
+        existing = _read(folder)
         differences = [
             f"{name} {before!r} there, {now!r} now"
-            for (name, before), now in zip(
-                asdict(existing).items(), asdict(grid).values(), strict=True
-            )
-            if before != now
+            for name, now in asdict(grid).items()
+            if (before := getattr(existing, name)) != now
         ]
-        if not differences and presets != _presets(grid):
+        if not differences and asdict(existing)["presets"] != _presets(grid):
             differences = [f"the {grid.preset_name!r} presets have changed since"]
         if differences:
             raise GymMaraError(
@@ -108,14 +158,11 @@ def open_grid(folder: Path, grid: Grid) -> None:
         return
     if folder.exists() and not folder.is_dir():
         raise GymMaraError(f"{str(folder)!r} is a file: choose another --out")
-    if folder.exists() and any(entry.name != ".grid.json.tmp" for entry in folder.iterdir()):
+    if folder.exists() and any(not entry.name.startswith(".grid-") for entry in folder.iterdir()):
         raise GymMaraError(f"{str(folder)!r} holds files but no grid: choose another --out")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        values = {**asdict(grid), "presets": _presets(grid)}
-        write_atomically(file, json.dumps(values, indent=2) + "\n")
-    except OSError as error:
-        raise GymMaraError(f"cannot write to {str(folder)!r}: {error}") from error
+    write_json(file, {**asdict(grid), "presets": _presets(grid)})
 
 
 def read_grid(folder: Path) -> Grid:
@@ -124,26 +171,31 @@ def read_grid(folder: Path) -> Grid:
     Raises:
         GymMaraError: the folder holds no grid, or grid.json is damaged.
     """
-    return _read(folder)[0]
+    read = asdict(_read(folder))
+    del read["presets"]
+    return Grid(**read)
 
 
-def _presets(grid: Grid) -> Any:
+def _presets(grid: Grid) -> dict[str, Any]:
     """A grid's presets as they are now, as JSON values."""
     pairs = {algo: algorithm(algo).preset_pair(grid.preset_name) for algo in grid.algos}
-    return json.loads(json.dumps({algo: list(map(asdict, pair)) for algo, pair in pairs.items()}))
+    return {
+        algo: tuple(json.loads(json.dumps(asdict(preset))) for preset in pair)
+        for algo, pair in pairs.items()
+    }
 
 
-def _read(folder: Path) -> tuple[Grid, Any]:
+def _read(folder: Path) -> _GridFile:
     """A grid, and the presets that it was started with."""
     try:
-        values = json.loads((folder / "grid.json").read_text())
-        values |= {name: tuple(values[name]) for name in ("envs", "algos")}
-        presets = values.pop("presets")
-        return Grid(**values), presets
-    except FileNotFoundError:
+        grid = read_json(folder / "grid.json", _GridFile)
+    except MissingFileError:
         raise GymMaraError(f"{str(folder)!r} holds no grid: there is no grid.json") from None
-    except (ValueError, TypeError, KeyError, OSError) as error:
-        raise GymMaraError(f"cannot read grid.json in {str(folder)!r}: {error}") from error
+    try:
+        grid.check()
+    except GymMaraError as error:
+        raise DamagedFileError(f"cannot read {str(folder / 'grid.json')!r}: {error}") from None
+    return grid
 
 
 def run_grid(folder: Path, grid: Grid, executor: Executor, on_message: OnMessage) -> dict[str, str]:
@@ -163,7 +215,7 @@ def run_grid(folder: Path, grid: Grid, executor: Executor, on_message: OnMessage
     jobs = {
         name: partial(run_one, folder / name, config)
         for name, config in grid.runs().items()
-        if read_result(folder / name) is None
+        if valid_result(folder / name) is None
     }
     return executor(jobs, on_message)
 
@@ -183,18 +235,21 @@ def run_one(path: Path, config: RunConfig, send: Send) -> None:
     def on_progress(steps: int, shown: dict[str, float]) -> None:
         send((steps, dict(shown)))
 
-    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=PATIENCE)
-    try:
-        with lock:  # the operating system releases it if this process is killed
-            try:
-                result = _result(_trained(path, config, on_progress))
-            except DamagedRunError as error:
-                renamed = _set_aside(path)
-                send(f"{error}; renamed to {renamed.name!r} and trained again")
-                result = _result(train(config, path, on_progress))
-            write_atomically(path / "result.json", json.dumps(result, indent=2) + "\n")
-    except Timeout:
-        raise GymMaraError(f"another process is training {str(path)!r}; wait for it") from None
+    busy = f"another process is training {str(path)!r}; wait for it"
+    with locked(path.with_name(f".{path.name}.lock"), busy, PATIENCE):
+        try:
+            result = _result(_trained(path, config, on_progress))
+        except DamagedRunError as error:
+            renamed = _set_aside(path)
+            send(f"{error}; renamed to {renamed.name!r} and trained again")
+            result = _result(train(config, path, on_progress))
+        file = path / "result.json"
+        if os.path.lexists(file) and valid_result(path) is None:
+            renamed = _set_aside(file)
+            send(f"{file.name} is damaged; renamed to {renamed.name!r} and written again")
+        write_json(file, result)
+        distance = result["last"]["position_error_mm"]
+        send((config.steps, {} if distance is None else {"eval_position_error_mm": distance}))
 
 
 def _trained(path: Path, config: RunConfig, on_progress: OnProgress) -> RunFolder:
@@ -210,15 +265,16 @@ def _trained(path: Path, config: RunConfig, on_progress: OnProgress) -> RunFolde
 
 
 def _set_aside(path: Path) -> Path:
-    """Rename a damaged run; its new path."""
+    """Rename a damaged run or file; its new path."""
     number = 1
-    while (renamed := path.with_name(f"{path.name}.damaged{number}")).exists():
+    while os.path.lexists(renamed := path.with_name(f"{path.name}.damaged{number}")):
         number += 1
-    os.replace(path, renamed)
+    with writing(renamed):
+        os.replace(path, renamed)
     return renamed
 
 
-def _result(run: RunFolder) -> dict[str, Any]:
+def _result(run: RunFolder) -> Result:
     """The result of a finished run: the metrics of each policy, and how long the training took."""
     rows = read_progress(run.progress_file) if run.progress_file.is_file() else []
     if not any(_TRAINING in row for row in rows):
@@ -232,17 +288,41 @@ def _result(run: RunFolder) -> dict[str, Any]:
             raise DamagedRunError(
                 f"the run {str(run.path)!r} is damaged: its {which!r} policy is missing"
             )
-    policies = {
-        which: {k: float(v.mean()) for k, v in evaluate_run(run, episodes=1, which=which).items()}
-        for which in POLICIES
+    return {
+        "last": _metrics(run, "last"),
+        "best": _metrics(run, "best"),
+        "steps_to_10_mm": int(reached[0]) if reached else None,
+        "seconds": float(run.seconds()),
     }
-    return {**policies, "steps_to_10_mm": reached[0] if reached else None, "seconds": run.seconds()}
 
 
-def read_result(path: Path) -> dict[str, Any] | None:
-    """The result of a run; None if it has not finished."""
+def _metrics(run: RunFolder, which: str) -> Metrics:
+    means = {
+        name: float(v.mean()) for name, v in evaluate_run(run, episodes=1, which=which).items()
+    }
+    metrics: Any = {name: value if math.isfinite(value) else None for name, value in means.items()}
+    return cast("Metrics", metrics)
+
+
+def read_result(path: Path) -> Result | None:
+    """The result of a run; None if it has not finished.
+
+    Raises:
+        DamagedRunError: result.json is damaged; the message says how to write it again.
+    """
     try:
-        result = json.loads((path / "result.json").read_text())
-        return result if isinstance(result, dict) and {*POLICIES} <= result.keys() else None
-    except (OSError, ValueError):
+        return read_json(path / "result.json", Result)
+    except MissingFileError:
+        return None
+    except DamagedFileError as error:
+        raise DamagedRunError(
+            f"{error}; give the same benchmark command again to evaluate the run again"
+        ) from None
+
+
+def valid_result(path: Path) -> Result | None:
+    """The result of a run; None if it has not finished or result.json is damaged."""
+    try:
+        return read_result(path)
+    except DamagedRunError:
         return None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,23 +13,37 @@ from typing import Any
 
 import numpy as np
 import optuna
-from filelock import FileLock, Timeout
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, is_schedule
 from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
+from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS
 from gym_mara.agents.experiments.local_executor import run_in_processes
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.errors import GymMaraError, TrainingDivergedError
+from gym_mara.errors import GymMaraError, TrainingDivergedError, unknown, whole_number
+from gym_mara.files import (
+    BusyError,
+    DamagedFileError,
+    MissingFileError,
+    locked,
+    read_bytes,
+    short,
+    writing,
+    written_aside,
+)
+from gym_mara.tasks import TASKS
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
 """Trials train on seeds from here on; reported results use seeds from 0 on."""
+MOST_TRIALS = 100_000
+_LOG, _LARGEST_LOG = "study.log", 2**28
+"""Optuna's log of the trials, and its largest size, bytes."""
 _EVALUATIONS = 10
 """How often a run is evaluated; after each evaluation its trial may be pruned."""
 
@@ -43,6 +59,15 @@ class Search:
     seeds: int
     """How many runs make a trial; its value is their mean."""
 
+    def check(self) -> None:
+        """Raises GymMaraError if a name is unknown or a number is out of range."""
+        if self.env not in TASKS:
+            raise unknown("environment", self.env, TASKS)
+        algorithm(self.algo)
+        for name, most in (("steps", MOST_STEPS), ("trials", MOST_TRIALS), ("seeds", MOST_SEEDS)):
+            if whole_number(name, value := getattr(self, name)) > most:
+                raise GymMaraError(f"{name} must be at most {most:,}, not {short(value)}")
+
     def config(self, seed: int) -> RunConfig:
         """The configuration of one run, on the default backend."""
         every = max(1, self.steps // _EVALUATIONS)
@@ -55,30 +80,67 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
     """The study of a search in its folder, new or with the trials so far.
 
     Raises:
-        GymMaraError: a name is unknown, or the folder holds another search.
+        GymMaraError: a value is wrong, the folder holds another search, its log is damaged, or it cannot be written.
     """
+    search.check()
     start = preset_of(search.config(FIRST_SEED))
-    folder = (
-        folder.resolve()
-    )  # Optuna's lock is a symbolic link, and a relative path would break it
-    folder.mkdir(parents=True, exist_ok=True)
-    study = optuna.create_study(
-        study_name="search",
-        storage=JournalStorage(JournalFileBackend(str(folder / "study.log"))),
-        sampler=optuna.samplers.TPESampler(multivariate=True, constant_liar=True),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=8, n_warmup_steps=_EVALUATIONS // 3),
-        load_if_exists=True,
-    )
-    wanted = {name: value for name, value in asdict(search).items() if name != "trials"}
-    existing = study.user_attrs.get("search")
-    if existing is None:
-        study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
-        study.set_user_attr("search", wanted)
-    elif existing != wanted:
+    with writing(folder):
+        # Resolved because Optuna's lock is a symbolic link, and a relative path would break it.
+        folder = folder.resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+    _check_log(folder)
+    with _replayed(folder / _LOG):
+        study = optuna.create_study(
+            study_name="search",
+            storage=JournalStorage(JournalFileBackend(str(folder / _LOG))),
+            sampler=optuna.samplers.TPESampler(multivariate=True, constant_liar=True),
+            pruner=optuna.pruners.MedianPruner(
+                n_startup_trials=8, n_warmup_steps=_EVALUATIONS // 3
+            ),
+            load_if_exists=True,
+        )
+        wanted = {name: value for name, value in asdict(search).items() if name != "trials"}
+        existing = study.user_attrs.get("search")
+        if existing is None:
+            study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
+            study.set_user_attr("search", wanted)
+        best_trial(study)  # reads all trials
+    if existing not in (None, wanted):
         raise GymMaraError(
-            f"{str(folder)!r} holds another search, {existing}: choose another --out"
+            f"{str(folder)!r} holds another search, {short(existing)}: choose another --out"
         )
     return study
+
+
+def _check_log(folder: Path) -> None:
+    """Check the log of a search, if there is one, and remove a last line that a kill or a full disk has cut.
+
+    Raises:
+        DamagedFileError: the log is not a plain file, or is too large.
+    """
+    log = folder / _LOG
+    try:
+        text = read_bytes(log, _LARGEST_LOG)
+    except MissingFileError:
+        return
+    if text and not text.endswith(b"\n"):
+        # A search that holds the lock may be writing this line now.
+        with suppress(BusyError), locked(folder / ".lock", "busy"), written_aside(log) as aside:
+            aside.write_bytes(text[: text.rfind(b"\n") + 1])
+
+
+@contextmanager
+def _replayed(log: Path) -> Iterator[None]:
+    """Turn what Optuna raises while it reads a log into a GymMaraError that names it."""
+    with writing(log):
+        try:
+            yield
+        except (GymMaraError, OSError):
+            raise
+        except Exception as error:  # a hostile log can fail anywhere in Optuna
+            raise DamagedFileError(
+                f"the log {str(log)!r} is damaged ({type(error).__name__}: {short(error)}): choose another --out"
+            ) from error
 
 
 def run_search(
@@ -99,18 +161,15 @@ def run_search(
         GymMaraError: the folder holds another search, or another command searches there.
     """
     study = open_study(search, folder)
-    try:
-        with FileLock(folder / ".lock", timeout=0):
+    busy = f"another process is searching in {str(folder)!r}: wait for it, or choose another --out"
+    with locked(folder / ".lock", busy):
+        with _replayed(folder / _LOG):
             for trial in study.get_trials(deepcopy=False, states=(_State.RUNNING,)):
                 study.tell(trial.number, state=_State.FAIL)
                 study.enqueue_trial({**trial.system_attrs.get("fixed_params", {}), **trial.params})
-            job = partial(run_trials, search, folder)
-            jobs = {f"worker {number}": job for number in range(processes)}
-            return run_in_processes(jobs, on_message, processes)
-    except Timeout:
-        raise GymMaraError(
-            f"another process is searching in {str(folder)!r}: wait for it, or choose another --out"
-        ) from None
+        job = partial(run_trials, search, folder)
+        jobs = {f"worker {number}": job for number in range(min(processes, search.trials))}
+        return run_in_processes(jobs, on_message, processes)
 
 
 def run_trials(search: Search, folder: Path, send: Send) -> None:
@@ -118,7 +177,8 @@ def run_trials(search: Search, folder: Path, send: Send) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = open_study(search, folder)
     while finished_trials(study) < search.trials:
-        study.optimize(partial(_value, search, send), n_trials=1)
+        with writing(folder / _LOG):
+            study.optimize(partial(_value, search, send), n_trials=1)
         send(finished_trials(study))
 
 

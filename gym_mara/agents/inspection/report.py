@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import os
 import tempfile
 from pathlib import Path
@@ -14,10 +13,11 @@ from gym_mara.agents.inspection.report_figures import Episode
 from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.watch import film_run
 from gym_mara.agents.runs.evaluation import options_on
-from gym_mara.agents.runs.folder import RunFolder, write_atomically
+from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import installed_backends
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
+from gym_mara.files import read_text, write_text, writing
 
 with needs("a report", "render", "jinja2"):
     from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -44,7 +44,7 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
         GymMaraError: the file exists or cannot be written; the policy is missing or damaged.
         MissingExtraError: a library that draws, or the engine of the run's own backend, is not installed.
     """
-    file = _checked(run, file)
+    new, file = file is not None, _checked(run, file)
     config = run.config
     installed, missing = installed_backends()
     backends = [config.backend, *(name for name in installed if name != config.backend)]
@@ -66,18 +66,15 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
         joints=_markup(figures.joints(episodes, robot)),
         torques=_markup(figures.torques(episodes, robot)),
         path=_markup(figures.path(episodes, target)),
-        configuration=json.dumps(json.loads((run.path / "config.json").read_text()), indent=2),
+        configuration=read_text(run.path / "config.json"),
     )
-    try:
-        write_atomically(file, page)
-    except OSError as error:
-        raise GymMaraError(f"cannot write the report {str(file)!r}: {error}") from error
+    write_text(file, page, new=new)
     return file
 
 
 def _checked(run: RunFolder, file: Path | None) -> Path:
     """The file of the page; an error before anything is played if it cannot be written."""
-    if file is not None and file.exists():
+    if file is not None and os.path.lexists(file):
         raise GymMaraError(f"{str(file)!r} exists and is not overwritten: choose another --out")
     file = file or run.path / "report.html"
     if not os.access(file.parent, os.W_OK):
@@ -101,7 +98,7 @@ def _markup(figure: go.Figure | None, *, with_library: bool = False) -> Markup |
 
 def _video(run: RunFolder, backends: list[str], which: str) -> str:
     """A film of the policy on these backends, side by side, as base64."""
-    with tempfile.TemporaryDirectory() as folder:
+    with writing(Path(tempfile.gettempdir())), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
         size = {"width": 480, "height": 400}
         film_run(run, path, backends, size, which=which, seconds=_VIDEO_SECONDS, rate=25.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gym_mara.agents.inspection.rollout import Trajectory
-from gym_mara.agents.inspection.transfer import settled_after
+from gym_mara.agents.inspection.transfer import settling_time
 from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
@@ -121,11 +121,15 @@ def path(episodes: Episodes, target: Floats) -> go.Figure:
     x, y, z = target[:, None]
     marker = {"color": "#d62728", "size": 5, "symbol": "cross"}
     figure.add_scatter3d(x=x, y=y, z=z, mode="markers", name="target", marker=marker)
-    axes = {f"{axis}axis": {"title": f"{axis}, m"} for axis in "xyz"}
-    figure.update_layout(
-        scene={"aspectmode": "data", **axes, "camera": {"eye": {"x": -1.9, "y": -1.9, "z": 1.1}}},
-        height=560,
-    )
+    points = np.vstack([target, *(episode.played.tool[:, 0] for episode in episodes)])
+    middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
+    half = 0.6 * max(float(np.ptp(points, axis=0).max()), 0.01)
+    axes = {
+        f"{name}axis": {"title": f"{name}, m", "range": [centre - half, centre + half], "nticks": 6}
+        for name, centre in zip("xyz", middle, strict=True)
+    }
+    camera = {"eye": {"x": -1.6, "y": -1.6, "z": 1.0}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
+    figure.update_layout(scene={"aspectmode": "cube", **axes, "camera": camera}, height=640)
     return figure
 
 
@@ -176,6 +180,8 @@ def _colour(number: int) -> str:
 
 
 def _until_settled(episodes: Episodes) -> list[float]:
-    """The range of time that a figure shows first, s: twice the time that the slowest arm needs to settle."""
-    settled = (e.played.period * settled_after(e.played.position_error)[0] for e in episodes)
-    return [0.0, max(1.0, 2.0 * max(settled))]
+    """The range of time that a figure shows first, s: twice the time that the slowest of the settled arms needs."""
+    times = [settling_time(e.played.position_error, e.played.period)[0] for e in episodes]
+    settled = [time for time in times if np.isfinite(time)]
+    longest = max(episode.seconds[-1] for episode in episodes)
+    return [0.0, max(1.0, 2.0 * max(settled)) if settled else longest]

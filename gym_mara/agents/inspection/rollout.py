@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.runs.evaluation import make_env
+from gym_mara.agents.runs.evaluation import chose_robot, make_arms
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
 from gym_mara.backends import backend_settings
@@ -29,12 +29,12 @@ class Player:
     Args:
         run: the run.
         backend: the backend.
-        options: keyword arguments of the environment.
+        options: keyword arguments of the environment, from `options_on`.
         which: the policy, "last" or "best".
         episodes: N.
 
     Raises:
-        GymMaraError: the policy is missing, damaged or of another environment, or an option is unknown or out of range.
+        GymMaraError: the policy is missing, damaged or of another environment or robot, or an option is unknown or out of range.
     """
 
     def __init__(
@@ -47,11 +47,10 @@ class Player:
         episodes: int = 1,
     ) -> None:
         config = run.config
-        vec_env = make_env(config.env, backend, episodes, options, max_episode_steps=None)
-        self.env = vec_env.env
+        self.policy = load_policy(run, which)
+        self.env = make_arms(config.env, backend, episodes, options, max_episode_steps=None)
         try:
-            self._targets = vec_env.targets
-            self._policy, self._normalisation = load_policy(run.policy(which), config, vec_env)
+            self.policy.check(self.env.simulation, any_robot=chose_robot(options))
             self._observation, _ = self.env.reset(seed=config.seed)
         except BaseException:
             self.env.close()
@@ -59,9 +58,7 @@ class Player:
 
     def act(self, observation: Floats) -> Floats:
         """The joint targets (N, J), rad, for observations (N, O)."""
-        normalised: Any = self._normalisation.normalize_obs(observation)
-        action, _ = self._policy.predict(normalised, deterministic=True)
-        return self._targets(action)
+        return self.policy.predict(observation)[0]
 
     def step(self) -> Outcome:
         """Let the policy act for one step; the outcome holds the state that the task judged."""
@@ -69,6 +66,19 @@ class Player:
         outcome = self.env.simulation.outcome
         assert outcome is not None
         return outcome
+
+    @property
+    def velocity_limit(self) -> float | None:
+        """If the joints teleport, the value of VELOCITY_LIMIT with which they travel: the robot's lowest velocity limit, rad/s.
+
+        None if they do not teleport, or if the backend or the robot has no limit.
+        """
+        simulation = self.env.simulation
+        lowest = float(simulation.robot.velocity_limit.min())
+        limited = VELOCITY_LIMIT in backend_settings(simulation.backend_name)
+        if simulation.backend.teleports and limited and 0.0 < lowest < math.inf:
+            return lowest
+        return None
 
     def __enter__(self) -> Player:
         return self
@@ -80,28 +90,6 @@ class Player:
         trace: TracebackType | None,
     ) -> None:
         self.env.close()
-
-
-def velocity_limit(task: str, backend: str, options: dict[str, Any]) -> dict[str, float]:
-    """The setting that makes joints travel that teleport with these options: the robot's lowest velocity limit, rad/s.
-
-    Args:
-        task: the name of a task.
-        backend: the name of a backend.
-        options: keyword arguments of the environment.
-
-    Returns:
-        The setting; nothing if the joints do not teleport, or the backend or the robot has no limit.
-    """
-    if VELOCITY_LIMIT not in backend_settings(backend):
-        return {}
-    vec_env = make_env(task, backend, 1, options)
-    simulation = vec_env.env.simulation
-    vec_env.close()
-    lowest = float(simulation.robot.velocity_limit.min())
-    if not simulation.backend.teleports or not 0.0 < lowest < math.inf:
-        return {}
-    return {VELOCITY_LIMIT: lowest}
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Player, roll_out, velocity_limit
+from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
-from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.envs.sensors import SensorSettings
+from gym_mara.errors import unknown, whole_number
+from gym_mara.tasks import named_task
 from gym_mara.types import Floats
 
 SETTLED = 0.005
-"""An arm has settled once its position error stays this close to its final value, m."""
+"""An arm has settled at the target once its position error stays below this value, m."""
+HELD = 1.0
+"""How long it must have stayed there at the end of an episode to count as settled, s."""
 
 
 class Transferred(NamedTuple):
@@ -30,7 +35,7 @@ class Transferred(NamedTuple):
     return_: Floats
     collisions: Floats
     settling_time_s: Floats
-    """From this time on the position error stays within 5 mm of its final value."""
+    """From this time on the arm stays within 5 mm of the target; NaN in an episode in which it never settles there."""
     highest_torque: Floats
     """Of any joint, relative to its limit; NaN on a backend without dynamics."""
     highest_velocity: Floats
@@ -46,14 +51,15 @@ def transfer(
         run: the run.
         episodes: how many on each backend; they differ only if the options make them random.
         which: the policy, "last" or "best".
-        options: settings of backends; each backend gets those that it knows.
+        options: keyword arguments of the environment. Those of the task, the sensors and the robot count on every
+            backend; a setting of backends goes to those that know it.
 
     Returns:
         A row for each backend. A backend whose joints teleport and that can limit their velocity has a second row, with the
         robot's lowest velocity limit for all joints.
 
     Raises:
-        GymMaraError: the policy is missing or damaged, or no installed backend knows an option.
+        GymMaraError: the policy is missing or damaged, or an option is unknown or out of range.
     """
     whole_number("episodes", episodes)
     of_env, given = options_beyond_backend(run.config), options or {}
@@ -61,41 +67,61 @@ def transfer(
     for reason in reasons:
         warnings.warn(reason, stacklevel=2)
     settings = {name: backend_settings(name) for name in installed}
-    if lost := set(given).difference(*settings.values()):
-        raise GymMaraError(
-            f"no installed backend knows the setting {min(lost)!r}; "
-            f"known: {', '.join(sorted(set().union(*settings.values())))}"
-        )
+    everywhere = _names_of_env(run.config.env)
+    for name in given:
+        valid = everywhere.union(*settings.values())
+        if name not in valid:
+            raise unknown("keyword argument", name, valid, " on any installed backend")
     rows = []
     for name, known in settings.items():
-        chosen = {key: value for key, value in given.items() if key in known}
-        limit = velocity_limit(run.config.env, name, {**of_env, **chosen})
-        for variant in [chosen, {**chosen, **limit}] if limit else [chosen]:
-            title = ", ".join([name, *(f"{key}={value}" for key, value in variant.items())])
-            rows.append(_play(run, title, name, {**of_env, **variant}, episodes, which))
+        chosen = {key: value for key, value in given.items() if key in everywhere or key in known}
+        row, velocity_limit = _play(run, name, of_env, chosen, episodes, which)
+        rows.append(row)
+        if velocity_limit is not None:
+            limited = {**chosen, VELOCITY_LIMIT: velocity_limit}
+            rows.append(_play(run, name, of_env, limited, episodes, which)[0])
     return rows
 
 
+def _names_of_env(task: str) -> set[str]:
+    """The keyword arguments of an environment that every backend knows, without those of pictures."""
+    forms: tuple[Any, ...] = named_task(task), SensorSettings
+    return {"robot", "ee_frame", *(field.name for form in forms for field in fields(form))}
+
+
 def _play(
-    run: RunFolder, title: str, backend: str, options: dict[str, Any], episodes: int, which: str
-) -> Transferred:
-    with Player(run, backend, options, which=which, episodes=episodes) as player:
+    run: RunFolder,
+    backend: str,
+    of_env: dict[str, Any],
+    chosen: dict[str, Any],
+    episodes: int,
+    which: str,
+) -> tuple[Transferred, float | None]:
+    """How a policy does on a backend; and the player's velocity limit."""
+    with Player(run, backend, {**of_env, **chosen}, which=which, episodes=episodes) as player:
         played = roll_out(player)
-        effort_limit = player.env.simulation.robot.effort_limit
-    return Transferred(
-        backend=title,
+        robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
+    row = Transferred(
+        backend=", ".join([backend, *(f"{key}={value}" for key, value in chosen.items())]),
         position_error_mm=1000.0 * played.position_error[-1],
         angle_deg=np.degrees(played.angle_error[-1]),
         return_=played.reward.sum(axis=0),
         collisions=played.collided.sum(axis=0, dtype=np.float64),
-        settling_time_s=played.period * settled_after(played.position_error),
-        highest_torque=np.abs(played.torque / effort_limit).max(axis=(0, 2)),
+        settling_time_s=settling_time(played.position_error, played.period),
+        highest_torque=np.abs(played.torque / robot.effort_limit).max(axis=(0, 2)),
         highest_velocity=np.abs(played.qd).max(axis=(0, 2)),
     )
+    return row, velocity_limit
 
 
-def settled_after(error: Floats) -> Floats:
-    """The number of steps (N,) after which the errors (T, N), m, stay within SETTLED of their final values."""
-    unsettled = np.abs(error - error[-1]) > SETTLED
-    steps = len(error) - unsettled[::-1].argmax(axis=0)
-    return np.where(unsettled.any(axis=0), steps, 0).astype(np.float64)
+def settling_time(error: Floats, period: float) -> Floats:
+    """The time (N,), s, after which an arm stays within SETTLED of the target; NaN if it is not there for the last HELD s.
+
+    Args:
+        error: position errors (T, N), m, the first of them one period after the start.
+        period: between two of them, s.
+    """
+    away = ~(error <= SETTLED)  # NaN is away, too
+    steps = np.where(away.any(axis=0), len(error) - away[::-1].argmax(axis=0), 0)
+    held = (len(error) - steps) * period
+    return np.where(held >= HELD, steps * period, np.nan)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -11,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, velocity_limit
+from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player
 from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.rendering import RenderSettings
 from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path, labelled
 from gym_mara.viewer import watch
 
-_RENDERING = {field.name for field in dataclasses.fields(RenderSettings)}
 _STILL = 0.5
 """How long a film shows the start pose before the arm moves, s."""
 
@@ -57,7 +54,7 @@ def film_run(
     with ExitStack() as stack:
         players = []
         for backend in backends:
-            settings = _settings(run, backend, options, log) | {"render_mode": "rgb_array"}
+            settings = _settings(run, backend, options, which, log) | {"render_mode": "rgb_array"}
             players.append(stack.enter_context(Player(run, backend, settings, which=which)))
         period = players[0].env.simulation.backend.control_period
         every = math.ceil(speed / period / rate)
@@ -102,26 +99,30 @@ def watch_run(
     Raises:
         GymMaraError: the policy is missing or damaged, a value is out of its range, or the viewer cannot open.
     """
-    settings = _settings(run, backend, options, log)
+    settings = _settings(run, backend, options, which, log)
     with Player(run, backend, settings, which=which) as player:
         act = player.act
     watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
 
 
 def _settings(
-    run: RunFolder, backend: str, options: dict[str, Any], log: Callable[[str], None] | None
+    run: RunFolder,
+    backend: str,
+    options: dict[str, Any],
+    which: str,
+    log: Callable[[str], None] | None,
 ) -> dict[str, Any]:
     """The keyword arguments with which a run is shown on a backend."""
-    # Only the user says how things are shown: a run may come from a stranger, and must not open the viewer to the network.
-    own = {k: v for k, v in options_on(backend, run.config).items() if k not in _RENDERING}
-    settings = own | options
-    if VELOCITY_LIMIT not in settings and (
-        limit := velocity_limit(run.config.env, backend, settings)
-    ):
-        settings |= limit
-        if log is not None:
-            log(
-                f"{backend}: shown with joints of at most {limit[VELOCITY_LIMIT]:.3g} rad/s, the robot's limit; "
-                f"to see them teleport, --set {VELOCITY_LIMIT}=null"
-            )
-    return settings
+    settings = options_on(backend, run.config, options)
+    if VELOCITY_LIMIT in settings:
+        return settings
+    with Player(run, backend, settings, which=which) as player:
+        limit = player.velocity_limit
+    if limit is None:
+        return settings
+    if log is not None:
+        log(
+            f"{backend}: shown with joints of at most {limit:.3g} rad/s, the robot's limit; "
+            f"to see them teleport, --set {VELOCITY_LIMIT}=null"
+        )
+    return settings | {VELOCITY_LIMIT: limit}

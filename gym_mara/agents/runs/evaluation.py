@@ -6,18 +6,45 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
+from gym_mara.agents.runs.config import check_options
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.runs.policy import load_policy
 from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.scaling import unit_box
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
 from gym_mara.tasks import MAX_EPISODE_STEPS
 from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
+
+
+MOST_EPISODES = 100_000
+
+
+def make_arms(
+    task: str,
+    backend: str,
+    num_envs: int,
+    options: dict[str, Any],
+    max_episode_steps: int | None = MAX_EPISODE_STEPS,
+) -> MaraVectorEnv:
+    """N arms of a task, in at most as many processes as arms."""
+    workers = options.get("workers")
+    if type(workers) is int and workers > num_envs:
+        options = {**options, "workers": num_envs}
+    return MaraVectorEnv(
+        num_envs,
+        task,
+        backend=backend,
+        autoreset_mode="SameStep",
+        max_episode_steps=max_episode_steps,
+        **options,
+    )
 
 
 def make_env(
@@ -27,20 +54,18 @@ def make_env(
     options: dict[str, Any],
     max_episode_steps: int | None = MAX_EPISODE_STEPS,
 ) -> MaraVecEnv:
-    """N arms of a task for Stable-Baselines3."""
-    env = MaraVectorEnv(
-        num_envs,
-        task,
-        backend=backend,
-        autoreset_mode="SameStep",
-        max_episode_steps=max_episode_steps,
-        **options,
-    )
-    return MaraVecEnv(env)
+    """N arms of a task for the agents of the presets, with actions in [-1, 1]."""
+    arms = make_arms(task, backend, num_envs, options, max_episode_steps)
+    return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
 
 
 def evaluate_run(
-    run: RunFolder, *, backend: str | None = None, episodes: int = 10, which: str = "last"
+    run: RunFolder,
+    *,
+    backend: str | None = None,
+    episodes: int = 10,
+    which: str = "last",
+    options: dict[str, Any] | None = None,
 ) -> dict[str, Floats]:
     """Play episodes with a run's deterministic policy.
 
@@ -49,29 +74,59 @@ def evaluate_run(
         backend: the backend to play on; by default the one that the run was trained on.
         episodes: the number of episodes.
         which: the policy, "last" or "best".
+        options: keyword arguments of the environment, in addition to those of the run.
 
     Returns:
         Each of METRICS per episode (episodes,); position error and angle are those of the last step.
 
     Raises:
-        GymMaraError: the policy is missing, damaged, or of another environment; episodes is below 1.
+        GymMaraError: the policy is missing, damaged, or of another environment or robot; episodes is out of its range; or
+            an option is unknown.
     """
-    if episodes < 1:
-        raise GymMaraError(f"episodes must be at least 1, not {episodes}")
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise GymMaraError(
+            f"episodes must be at least 1 and at most {MOST_EPISODES}, not {episodes}"
+        )
     config = run.config
+    policy = load_policy(run, which)
     backend = backend or config.backend
-    env = make_env(config.env, backend, episodes, options_on(backend, config))
+    settings = options_on(backend, config, options)
+    env = MaraVecEnv(make_arms(config.env, backend, episodes, settings))
     try:
-        policy, wrapped = load_policy(run.policy(which), config, env)
+        policy.check(env.env.simulation, any_robot=chose_robot(settings))
         env.seed(config.seed)
-        return play(policy, wrapped)
+        return play(policy, env)
     finally:
         env.close()
 
 
-def options_on(backend: str, config: RunConfig) -> dict[str, Any]:
-    """The keyword arguments of a run's environment; on another backend without the settings of the run's own."""
-    return config.env_options if backend == config.backend else options_beyond_backend(config)
+def options_on(
+    backend: str, config: RunConfig, options: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """The keyword arguments of a run's environment; on another backend without the settings of the run's own.
+
+    Args:
+        backend: the name of the backend.
+        config: the configuration of the run.
+        options: keyword arguments that replace those of the run. Another `robot` or `ee_frame` is loaded here; with it the
+            policy may play on a robot that differs from that of the training.
+
+    Raises:
+        GymMaraError: a name cannot be an option of a run, or the robot cannot be loaded.
+    """
+    own = config.env_options if backend == config.backend else options_beyond_backend(config)
+    given = options or {}
+    check_options(given, pictures=True)
+    merged = {**own, **given}
+    if "robot" in given or "ee_frame" in given:
+        frame = merged.pop("ee_frame", None)
+        merged["robot"] = RobotModel.load(merged.get("robot", "mara"), frame)
+    return merged
+
+
+def chose_robot(options: dict[str, Any]) -> bool:
+    """Whether these options, of `options_on`, have a robot that was given in addition to those of the run."""
+    return isinstance(options.get("robot"), RobotModel)
 
 
 def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
@@ -80,7 +135,7 @@ def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in config.env_options.items() if name not in own}
 
 
-def play(policy: PolicyPredictor, env: VecNormalize) -> dict[str, Floats]:
+def play(policy: PolicyPredictor, env: VecEnv) -> dict[str, Floats]:
     """Play one episode per arm with the deterministic policy; returns METRICS, each (N,)."""
     results: list[dict[str, Any] | None] = [None] * env.num_envs
     observation: Any = env.reset()

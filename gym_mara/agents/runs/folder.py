@@ -3,54 +3,44 @@
 config.json        the configuration, and the versions of the libraries
 progress.csv       a row per update and per evaluation
 tensorboard/       the same values for TensorBoard
-checkpoints/N/     the policy, its normalisation and the state to resume from, after N steps
-best/, last/       the policy with the best evaluation and the last one, each with its normalisation
+checkpoints/N/     the policy, and the state to resume from, after N steps
+best/, last/       the policy with the best evaluation and the last one
 learning_curve.png
+
+A policy's folder holds model.zip, the model in the form of Stable-Baselines3, and policy.json, which says how it is used.
 """
 
 from __future__ import annotations
 
 import csv
-import json
-import os
+import io
 import platform
+import re
 import shutil
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar, get_origin, get_type_hints
 
-from gym_mara.agents.algorithms.base import Preset
-from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
+from gym_mara.agents.runs.config import DamagedRunError, RunConfig, config_values, read_config
 from gym_mara.errors import GymMaraError, unknown
+from gym_mara.files import DamagedFileError, read_text, write_json
+from gym_mara.files import write_text as write_atomically
+
+__all__ = [
+    "POLICIES",
+    "DamagedRunError",
+    "RunConfig",
+    "RunFolder",
+    "read_progress",
+    "versions",
+    "write_atomically",
+]
 
 POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "sb3_contrib", "torch")
 _ENGINES = ("coal", "dartpy", "python-fcl")  # recorded if installed
-_Dataclass = TypeVar("_Dataclass")
-
-
-class DamagedRunError(GymMaraError):
-    """A file of a run is missing or cannot be read."""
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """What a run trains. The same configuration with the same versions of the libraries gives the same run."""
-
-    env: str
-    algo: str
-    backend: str
-    steps: int
-    seed: int
-    checkpoint_every: int = 50_000
-    """Steps between two checkpoints; each checkpoint is evaluated."""
-    env_options: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the environment, without `backend`."""
-    preset_name: str = DEFAULT_PRESET
-    preset: dict[str, Any] = field(default_factory=dict)
-    """The values of the preset, so that a later change of the preset does not change the run."""
+_LARGEST_TABLE = 2**29
+_LARGEST_WHOLE = 10**15
 
 
 class RunFolder:
@@ -80,15 +70,12 @@ class RunFolder:
             ) from None
         except OSError as error:
             raise GymMaraError(f"cannot make the run folder {str(path)!r}: {error}") from error
-        run = cls(path, config)
-        versions = {library: version(library) for library in _LIBRARIES}
-        for library in _ENGINES:
-            with suppress(PackageNotFoundError):
-                versions[library] = version(library)
-        versions["python"] = platform.python_version()
-        text = json.dumps({**asdict(config), "versions": versions}, indent=2) + "\n"
-        write_atomically(path / "config.json", text)
-        return run
+        try:
+            write_json(path / "config.json", config_values(config, versions()))
+        except GymMaraError:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
+        return cls(path, config)
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -101,15 +88,11 @@ class RunFolder:
         if not file.is_file():
             raise DamagedRunError(f"{str(path)!r} is not a run folder: it has no config.json")
         try:
-            values = dict(json.loads(file.read_text()))
-            values.pop("versions")
-            config = _as(RunConfig, values)
-            _as(Preset, config.preset)
-            return cls(path, config)
-        except (ValueError, KeyError, TypeError) as error:
-            raise DamagedRunError(
-                f"the run folder {str(path)!r} is damaged: cannot read config.json ({error})"
-            ) from error
+            config = read_config(file)
+            config.made_preset()
+        except DamagedFileError as error:
+            raise DamagedRunError(f"the run folder {str(path)!r} is damaged: {error}") from error
+        return cls(path, config)
 
     @property
     def progress_file(self) -> Path:
@@ -123,9 +106,15 @@ class RunFolder:
 
     def checkpoints(self) -> list[Path]:
         """The folders of the complete checkpoints, the oldest first."""
-        folder = self.path / "checkpoints"
-        found = [p for p in folder.glob("*") if p.name.isdigit()] if folder.is_dir() else []
-        return sorted(found, key=lambda p: int(p.name))
+        with suppress(OSError):
+            found = [p for p in (self.path / "checkpoints").iterdir() if _NUMBER.fullmatch(p.name)]
+            return sorted(found, key=lambda p: int(p.name))
+        return []
+
+    def trained_steps(self) -> int:
+        """The steps trained up to the last checkpoint; more than asked for, because an update is made of many steps."""
+        checkpoints = self.checkpoints()
+        return int(checkpoints[-1].name) if checkpoints else 0
 
     def has_policy(self, which: str) -> bool:
         """Whether the run has a policy "last" or "best"."""
@@ -147,53 +136,40 @@ class RunFolder:
         return folder
 
 
-def _as(cls: type[_Dataclass], values: dict[str, Any]) -> _Dataclass:
-    """A dataclass made of values from a file.
-
-    Raises:
-        TypeError: a field is missing, unknown, or of another type.
-    """
-    made = cls(**values)
-    for name, hint in get_type_hints(cls).items():
-        if type(value := getattr(made, name)) is not (get_origin(hint) or hint):
-            raise TypeError(f"{name} is {value!r}")
-    return made
-
-
-def write_atomically(file: Path, text: str) -> None:
-    """Write a file so that at any time, even after a kill, it holds either the old text or the new one."""
-    temporary = file.with_name(f".{file.name}.tmp")
-    with temporary.open("w") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, file)
-
-
-def replace_folder(new: Path, target: Path) -> None:
-    """Replace a folder by a new one; after a kill at any time at least one of the two exists."""
-    old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if target.exists():
-        os.replace(target, old)
-    os.replace(new, target)
-    shutil.rmtree(old, ignore_errors=True)
+def versions() -> dict[str, str]:
+    """The versions of Python and of the libraries on which a training depends."""
+    found = {library: version(library) for library in _LIBRARIES}
+    for library in _ENGINES:
+        with suppress(PackageNotFoundError):
+            found[library] = version(library)
+    return {**found, "python": platform.python_version()}
 
 
 def read_progress(file: Path) -> list[dict[str, float]]:
     """The rows of a table of progress, without their empty cells.
 
     Raises:
-        DamagedRunError: the file is not such a table.
+        DamagedRunError: the file is missing, or not such a table.
     """
     try:
-        with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        complete = [row for row in rows if row.get("time/total_timesteps")]
-        return [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
+        text = read_text(file, _LARGEST_TABLE)
+        text = text[: text.rfind("\n") + 1]  # a full disk may have cut the last row
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
+        if any(None in row for row in rows):
+            raise ValueError("a row has more cells than the table has columns")
+        complete = [row for row in rows if row.get(_STEPS)]
+        numbers = [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
+        for row in numbers:
+            if not 0 <= row[_STEPS] <= _LARGEST_WHOLE:
+                raise ValueError(f"{_STEPS} is {row[_STEPS]}")
+        return numbers
     except (csv.Error, ValueError) as error:
         raise DamagedRunError(f"the table {str(file)!r} is damaged: {error}") from error
 
 
+_STEPS = "time/total_timesteps"
+_NUMBER = re.compile("[0-9]{1,15}")
+
+
 def _number(text: str) -> float:
-    return int(text) if text.isdigit() else float(text)
+    return int(text) if _NUMBER.fullmatch(text) else float(text)

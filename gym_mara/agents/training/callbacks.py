@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import pickle
-import random
 import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.runs.evaluation import make_env, play
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.agents.runs.policy import normalisation, save_policy
+from gym_mara.agents.runs.policy import base_env, normalisation, save_policy
 from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, encoded_state
 from gym_mara.agents.training.learning_curve import plot_learning_curve
 
 OnProgress = Callable[[int, dict[str, float]], None]
@@ -31,18 +28,15 @@ class CheckpointCallback(BaseCallback):
 
     Args:
         run: the folder to write to.
-        best: the best evaluation so far, as reward per step.
-        elapsed: how long the run has trained before, s.
+        reached: what the training has reached before.
         on_progress: called after every rollout.
     """
 
-    def __init__(
-        self, run: RunFolder, best: float, elapsed: float, on_progress: OnProgress
-    ) -> None:
+    def __init__(self, run: RunFolder, reached: Progress, on_progress: OnProgress) -> None:
         super().__init__()
         self.run = run
-        self.best = best
-        self._started = time.monotonic() - elapsed
+        self.best = reached.best
+        self._started = time.monotonic() - reached.elapsed
         self.on_progress = on_progress
         self.shown: dict[str, float] = {}
         self._next = 0
@@ -97,15 +91,8 @@ class CheckpointCallback(BaseCallback):
         if self.shown["eval_reward_per_step"] > self.best:
             self.best = self.shown["eval_reward_per_step"]
             save_policy(self.run.path / "best", model)
-        state = {
-            "best": self.best,
-            "elapsed": elapsed,
-            "env": base_env(model).save_state(),
-            "returns": normalisation(model).returns,
-            "random": random_state(),
-        }
-        folder = self.run.path / "checkpoints" / str(steps)
-        save_policy(folder, model, {"state.pkl": pickle.dumps(state)})
+        state = encoded_state(model, Progress(self.best, elapsed))
+        save_policy(self.run.path / "checkpoints" / str(steps), model, {STATE_FILE: state})
 
     def _evaluate(self) -> dict[str, float]:
         trained = normalisation(self.model)  # type: ignore[arg-type]
@@ -121,23 +108,3 @@ class CheckpointCallback(BaseCallback):
             env.obs_rms = trained.obs_rms
         env.seed(self.run.config.seed)  # random episodes are the same in every evaluation
         return {name: float(values.mean()) for name, values in play(self.model, env).items()}
-
-
-def random_state() -> tuple[Any, ...]:
-    """The state of every random generator that Stable-Baselines3 uses."""
-    return random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-
-
-def restore_random_state(state: tuple[Any, ...]) -> None:
-    """Set the random generators to a state from `random_state`."""
-    python_state, numpy_state, torch_state = state
-    random.setstate(python_state)
-    np.random.set_state(numpy_state)  # noqa: NPY002
-    torch.set_rng_state(torch_state)
-
-
-def base_env(model: Any) -> MaraVecEnv:
-    """The environment inside a model's normalisation."""
-    env = normalisation(model).venv
-    assert isinstance(env, MaraVecEnv)
-    return env

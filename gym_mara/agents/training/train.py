@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
-import pickle
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,10 @@ from torch.utils.tensorboard import SummaryWriter
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
 from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.evaluation import make_env
-from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
-from gym_mara.agents.runs.policy import load_model, policy_arguments
-from gym_mara.agents.training.callbacks import (
-    CheckpointCallback,
-    OnProgress,
-    base_env,
-    restore_random_state,
-)
+from gym_mara.agents.runs.folder import RunConfig, RunFolder, read_progress
+from gym_mara.agents.runs.policy import base_env, policy_arguments
+from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
+from gym_mara.agents.training.checkpoint import Progress, restore_state
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
 
@@ -53,14 +49,8 @@ def train(
         GymMaraError: a name is unknown, a value is out of range, or the folder exists.
         TrainingDivergedError: the agent's parameters are no longer finite.
     """
-    for name in ("steps", "checkpoint_every"):
-        if getattr(config, name) < 1:
-            raise GymMaraError(f"{name} must be at least 1, not {getattr(config, name)}")
-    if not 0 <= config.seed < 2**32:
-        raise GymMaraError(f"seed must be a whole number from 0 to 2**32 - 1, not {config.seed}")
     algorithm(config.algo)  # an unknown name is an error before anything is built
-    preset = preset or preset_of(config)
-    config = RunConfig(**{**asdict(config), "preset": asdict(preset)})
+    config = replace(config, preset=asdict(preset or preset_of(config)))
     model = new_model(config)  # if this fails, no folder is made
     run = RunFolder.create(out, config)
     with _locked(run):
@@ -95,29 +85,18 @@ def resume(path: Path, on_progress: OnProgress) -> RunFolder:
 
 
 def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
-    config = run.config
-    checkpoints = run.checkpoints()
-    if not checkpoints:
-        return _learn(run, new_model(config), on_progress)
-    use_one_thread()
-    preset = Preset(**config.preset)
-    env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
-    model, wrapped = load_model(checkpoints[-1], config.algo, env)
-    if model.num_timesteps >= config.steps and run.has_policy("last"):
+    config, checkpoints = run.config, run.checkpoints()
+    if checkpoints and run.trained_steps() >= config.steps and run.has_policy("last"):
         raise GymMaraError(
             f"the run {str(run.path)!r} has finished its {config.steps} steps; start a new run to train longer"
         )
+    model = new_model(config)
     try:
-        state = pickle.loads((checkpoints[-1] / "state.pkl").read_bytes())
-        env.restore_state(state["env"])
-        wrapped.returns = state["returns"]
-        restore_random_state(state["random"])
-        best, elapsed = float(state["best"]), float(state["elapsed"])
-    except Exception as error:  # a damaged pickle may raise any exception
-        raise DamagedRunError(
-            f"the checkpoint {str(checkpoints[-1])!r} is damaged ({error}); delete it to resume from the one before"
-        ) from error
-    return _learn(run, model, on_progress, best=best, elapsed=elapsed)
+        reached = restore_state(model, checkpoints[-1]) if checkpoints else _NOTHING
+    except BaseException:
+        base_env(model).close()
+        raise
+    return _learn(run, model, on_progress, reached)
 
 
 @contextmanager
@@ -132,6 +111,8 @@ def _locked(run: RunFolder) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
+    except OSError as error:
+        raise GymMaraError(f"cannot write to {str(run.path)!r}: {error.strerror}") from error
     try:
         yield
     finally:
@@ -140,13 +121,21 @@ def _locked(run: RunFolder) -> Iterator[None]:
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
     """An untrained agent and its environment, from a configuration."""
-    preset = Preset(**config.preset)
+    preset = config.made_preset()
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
-    return new_agent(config.algo, preset, env, config.seed)
+    try:
+        return new_agent(config.algo, preset, env, config.seed)
+    except BaseException:
+        env.close()
+        raise
 
 
 def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
-    """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3."""
+    """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3.
+
+    Raises:
+        GymMaraError: the algorithm does not take an argument of the preset.
+    """
     use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
@@ -154,7 +143,13 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     arguments["policy_kwargs"] = policy_arguments(preset)
     policy = policy_class(preset.policy)
-    return algorithm(algo).load_class()(policy, wrapped, seed=seed, device="cpu", **arguments)
+    make = algorithm(algo).load_class()
+    try:
+        return make(policy, wrapped, seed=seed, device="cpu", **arguments)
+    except (TypeError, ValueError, AssertionError) as error:
+        if isinstance(error, GymMaraError):
+            raise
+        raise GymMaraError(f"{algo} does not take the preset's arguments: {error}") from error
 
 
 def use_one_thread() -> None:
@@ -178,15 +173,31 @@ def _schedule(value: Any) -> Any:
     return PiecewiseLinear(value) if is_schedule(value) else value
 
 
+_NOTHING = Progress(best=-np.inf, elapsed=0.0)
+# The errors of a file that cannot be written; others come from elsewhere, such as the pipe of a worker.
+_UNWRITABLE = {
+    getattr(errno, name, None)
+    for name in (
+        "EACCES",
+        "EDQUOT",
+        "EFBIG",
+        "EIO",
+        "EISDIR",
+        "ENOSPC",
+        "ENOTDIR",
+        "EPERM",
+        "EROFS",
+    )
+}
+
+
 def _learn(
     run: RunFolder,
     model: OnPolicyAlgorithm,
     on_progress: OnProgress,
-    *,
-    best: float = -np.inf,
-    elapsed: float = 0.0,
+    reached: Progress = _NOTHING,
 ) -> RunFolder:
-    callback = CheckpointCallback(run, best, elapsed, on_progress)
+    callback = CheckpointCallback(run, reached, on_progress)
     try:
         model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
         try:
@@ -195,6 +206,13 @@ def _learn(
             model.learn(left, callback=callback, reset_num_timesteps=False)
         finally:
             model.logger.close()
+    except OSError as error:
+        if isinstance(error, GymMaraError) or error.errno not in _UNWRITABLE:
+            raise
+        raise GymMaraError(
+            f"cannot write to {str(error.filename or run.path)!r}: {error.strerror}. "
+            f"What is trained is kept up to the last checkpoint: --resume {run.path}"
+        ) from error
     except TrainingDivergedError:
         raise
     except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
@@ -221,6 +239,8 @@ def _is_finite(model: OnPolicyAlgorithm) -> bool:
 def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
     """The table and the TensorBoard log; a resumed run drops what it wrote there after its last checkpoint."""
     kept = run.path / "progress.csv.kept"  # the old table, until its rows are in the new one
+    if os.path.lexists(run.progress_file) and not run.progress_file.is_file():
+        raise GymMaraError(f"cannot write {str(run.progress_file)!r}: it is not a plain file")
     if run.progress_file.is_file() and not kept.is_file():
         os.replace(run.progress_file, kept)
     rows = read_progress(kept) if kept.is_file() else []

@@ -58,7 +58,7 @@ def test_every_run_writes_its_result(finished_grid: Path) -> None:
     for name in GRID.runs():
         result = read_result(finished_grid / name)
         assert result is not None
-        assert result["last"]["position_error_mm"] > 0.0
+        assert (result["last"]["position_error_mm"] or 0.0) > 0.0
         assert result["seconds"] > 0.0
 
 
@@ -75,7 +75,7 @@ def test_a_killed_grid_is_resumed_with_the_same_results(
     finished_grid: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "grid"
-    options = ["--envs", "MARA-v0", "--algos", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
+    options = ["--env", "MARA-v0", "--algo", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
     command = ["-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
     command += ["--checkpoint-every", "2048", "--out", str(folder)]
     with started(*command) as process:
@@ -109,6 +109,22 @@ def test_a_damaged_run_is_renamed_and_trained_again(
     assert before is not None
     assert after is not None
     assert after["last"] == before["last"]
+
+
+def test_a_damaged_result_is_renamed_and_written_again(finished_grid: Path, tmp_path: Path) -> None:
+    folder, name = shutil.copytree(finished_grid, tmp_path / "grid"), "MARA-v0_ppo_0"
+    before = read_result(folder / name)
+    assert before is not None
+    (folder / name / "result.json").write_text("{}")
+    messages: list[Any] = []
+    assert run_grid(folder, GRID, processes(1), lambda *sent: messages.append(sent)) == {}
+    assert messages[0] == (
+        name,
+        "result.json is damaged; renamed to 'result.json.damaged1' and written again",
+    )
+    error = before["last"]["position_error_mm"]
+    assert messages[1] == (name, (GRID.steps, {"eval_position_error_mm": error}))
+    assert read_result(folder / name) == before
 
 
 def test_runs_that_failed_on_a_full_disk_are_resumed(finished_grid: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,6 @@ from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
-pytestmark = pytest.mark.slow
-
 SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
 
 
@@ -36,6 +36,7 @@ def ignore(*arguments: Any) -> None:
     """Messages go nowhere."""
 
 
+@pytest.mark.slow
 def test_a_search_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = []
 
@@ -54,6 +55,7 @@ def test_a_search_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert min(seeds) >= FIRST_SEED
 
 
+@pytest.mark.slow
 def test_a_killed_trial_is_repeated(tmp_path: Path) -> None:
     study = open_study(SMALL, tmp_path)
     acktr = algorithm("acktr")
@@ -122,6 +124,7 @@ def test_a_bad_trial_is_pruned_whatever_the_length_of_its_rollouts(
     assert played[11] == 2, "it is compared from the third evaluation on"
 
 
+@pytest.mark.slow
 def test_a_search_may_be_short(tmp_path: Path) -> None:
     short = Search(**{**vars(SMALL), "steps": 5, "trials": 1})
     run_trials(short, tmp_path, ignore)
@@ -134,6 +137,7 @@ def test_only_one_command_at_a_time_searches_in_a_folder(tmp_path: Path) -> None
         run_search(SMALL, tmp_path, 1, ignore)
 
 
+@pytest.mark.slow
 def test_several_processes_search_together(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
     assert run_search(SMALL, tmp_path, 2, ignore) == {}
@@ -160,3 +164,69 @@ def test_the_algorithm_accepts_the_values_of_its_search_space(algo: str) -> None
     model = new_agent(algo, preset, env, seed=0)
     assert isinstance(model, algorithm(algo).load_class())
     assert model.n_steps == chosen["n_steps"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env": "MARA v0"}, "unknown environment"),
+        ({"algo": "ppo2"}, "unknown algorithm"),
+        ({"steps": 10**400}, "steps must be"),
+        ({"trials": 0}, "trials must be"),
+        ({"trials": 10**9}, "trials must be at most 100,000"),
+        ({"seeds": 10**9}, "seeds must be at most 1,000"),
+    ],
+)
+def test_a_wrong_search_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(GymMaraError, match=message):
+        open_study(Search(**{**vars(SMALL), **change}), tmp_path / "search")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        b"garbage\n",
+        b"\x00\xff\n",
+        b"[" * 100_000 + b"\n",
+        b"{}\n",
+        b"[1]\n",
+        b'{"op_code": 0, "worker_id": "a"}\n',
+        b'{"op_code": 99, "worker_id": "a"}\n',
+    ],
+)
+def test_a_damaged_log_is_named(tmp_path: Path, log: bytes) -> None:
+    (tmp_path / "study.log").write_bytes(log)
+    with pytest.raises(GymMaraError, match=r"study.log' is damaged .* choose another --out"):
+        open_study(SMALL, tmp_path)
+
+
+def test_a_pipe_or_an_endless_log_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "pipe").mkdir()
+    (tmp_path / "endless").mkdir()
+    os.mkfifo(tmp_path / "pipe" / "study.log")
+    (tmp_path / "endless" / "study.log").symlink_to("/dev/zero")
+    for name in ("pipe", "endless"):
+        with pytest.raises(GymMaraError, match=r"study.log.*not a plain file"):
+            open_study(SMALL, tmp_path / name)
+
+
+def test_a_line_that_was_cut_off_does_not_end_the_search(tmp_path: Path) -> None:
+    open_study(SMALL, tmp_path)
+    with (tmp_path / "study.log").open("ab") as stream:
+        stream.write(b'{"op_code": 5, "wor')
+    open_study(SMALL, tmp_path).ask()
+    assert len(open_study(SMALL, tmp_path).get_trials()) == 1, "the trial that was enqueued"
+
+
+def test_a_full_disk_is_an_error_that_names_the_log(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    open_study(SMALL, tmp_path)
+    size = (tmp_path / "study.log").stat().st_size
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, hard))
+        with pytest.raises(GymMaraError, match=r"cannot write .*study.log.*File too large"):
+            open_study(SMALL, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert open_study(SMALL, tmp_path).user_attrs["search"]["env"] == "MARA-v0"

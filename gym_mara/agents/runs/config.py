@@ -1,0 +1,138 @@
+"""The configuration of a run: what may stand in it, and how it is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, TypeGuard
+
+from gym_mara.agents.algorithms.base import Preset, plain_values
+from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
+from gym_mara.errors import GymMaraError
+from gym_mara.files import DamagedFileError, parsed_json, read_json, short
+from gym_mara.rendering import RenderSettings
+
+MOST_STEPS = 10**12
+
+# Arguments of the environments that are no options of a run, and where to give them.
+_FIELDS = {
+    "task": "it is the run's env",
+    "backend": "the run names it itself",
+    "num_envs": "the preset sets the number of arms",
+    "max_episode_steps": "a run has episodes of their usual length",
+    "autoreset_mode": "Stable-Baselines3 needs 'SameStep'",
+    "self": "it is no argument",
+}
+_PICTURES = {"render_mode", *(setting.name for setting in dataclasses.fields(RenderSettings))}
+
+
+class DamagedRunError(DamagedFileError):
+    """A file of a run is missing or cannot be read."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What a run trains. The same configuration with the same versions of the libraries gives the same run.
+
+    The relative path of a robot is made absolute.
+
+    Raises:
+        GymMaraError: a value is out of its range, or is no option of a run.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    env: str
+    algo: str
+    backend: str
+    steps: int
+    """Of all arms together; training ends with the update that reaches them."""
+    seed: int
+    checkpoint_every: int = 50_000
+    """Steps between two checkpoints; each checkpoint is evaluated."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the environment, without `backend`."""
+    preset_name: str = DEFAULT_PRESET
+    preset: dict[str, Any] = field(default_factory=dict)
+    """The values of the preset, so that a later change of the preset does not change the run."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "checkpoint_every"):
+            if not 1 <= getattr(self, name) <= MOST_STEPS:
+                raise GymMaraError(
+                    f"{name} must be at least 1 and at most {MOST_STEPS}, not {short(getattr(self, name))}"
+                )
+        if not 0 <= self.seed < 2**32:
+            raise GymMaraError(
+                f"seed must be a whole number from 0 to 2**32 - 1, not {short(self.seed)}"
+            )
+        check_options(self.env_options, pictures=False)
+        options = dict(self.env_options)
+        if is_path(robot := options.get("robot")):
+            options["robot"] = str(Path(robot).absolute())
+        plain_values("env_options", options)
+        object.__setattr__(self, "env_options", options)
+
+    def made_preset(self) -> Preset:
+        """The preset of a run that was trained.
+
+        Raises:
+            GymMaraError: a value is missing, unknown or out of its range.
+        """
+        return parsed_json(json.dumps(self.preset), Preset, "the preset")
+
+
+@dataclass(frozen=True)
+class _ConfigFile(RunConfig):
+    """A configuration as it is written."""
+
+    versions: dict[str, str] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        robot = self.env_options.get("robot")
+        if is_path(robot) and not Path(robot).is_absolute():
+            raise GymMaraError(f"the path of the robot must be absolute, not {robot!r}")
+        super().__post_init__()
+
+
+def read_config(file: Path) -> RunConfig:
+    """Read the configuration of a run.
+
+    Raises:
+        MissingFileError: there is no such file.
+        DamagedFileError: a value is missing, unknown, of another type or out of range.
+    """
+    values = vars(read_json(file, _ConfigFile)).copy()
+    del values["versions"]
+    return RunConfig(**values)
+
+
+def config_values(config: RunConfig, versions: dict[str, str]) -> dict[str, Any]:
+    """The JSON values of a configuration."""
+    return {**dataclasses.asdict(config), "versions": versions}
+
+
+def check_options(options: dict[str, Any], *, pictures: bool) -> None:
+    """Check that the names of options can be options of a run; the environment checks the rest.
+
+    Args:
+        options: keyword arguments of an environment.
+        pictures: whether the settings of pictures and of the viewer are allowed.
+
+    Raises:
+        GymMaraError: a name is none of them.
+    """
+    for name in options:
+        if name in _FIELDS:
+            raise GymMaraError(f"{name!r} cannot be an option of a run: {_FIELDS[name]}")
+        if name in _PICTURES and not pictures:
+            raise GymMaraError(
+                f"{name!r} cannot be an option of a run: pictures and the viewer are set when a run is watched"
+            )
+
+
+def is_path(robot: Any) -> TypeGuard[str | Path]:
+    """Whether a robot is given by the path of its file."""
+    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))

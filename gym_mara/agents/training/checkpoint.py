@@ -1,0 +1,135 @@
+"""The state of a training: all that a resumed training needs to give the same result as one that was not interrupted."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+
+from gym_mara.agents.runs.archive import LARGEST
+from gym_mara.agents.runs.config import DamagedRunError
+from gym_mara.agents.runs.policy import base_env, normalisation, read_description
+from gym_mara.agents.runs.snapshot import decode, encode
+from gym_mara.errors import GymMaraError
+from gym_mara.files import DamagedFileError, read_bytes
+
+STATE_FILE = "state.bin"
+_OLD_STATE_FILE = "state.pkl"
+# Attributes of Stable-Baselines3's algorithms that change during a training.
+_ATTRIBUTES = (
+    "num_timesteps",
+    "_n_updates",
+    "_episode_num",
+    "_current_progress_remaining",
+    "_last_obs",
+    "_last_original_obs",
+    "_last_episode_starts",
+    "ep_info_buffer",
+    "ep_success_buffer",
+)
+_STATISTICS = ("obs_rms", "ret_rms")
+
+
+class Progress(NamedTuple):
+    """What a training has reached at a checkpoint."""
+
+    best: float
+    """The best evaluation so far, as reward per step."""
+    elapsed: float
+    """How long it has trained, s."""
+
+
+def encoded_state(model: OnPolicyAlgorithm, progress: Progress) -> bytes:
+    """The state of a training, before a rollout starts.
+
+    Raises:
+        GymMaraError: the environment's snapshot has a value that is not plain.
+    """
+    wrapped = normalisation(model)
+    return encode(
+        {
+            "progress": list(progress),
+            "parameters": _plain(model.get_parameters()),
+            "attributes": {name: getattr(model, name) for name in _ATTRIBUTES},
+            "statistics": {
+                name: vars(vars(wrapped)[name]).copy()
+                for name in _STATISTICS
+                if name in vars(wrapped)
+            },
+            "returns": wrapped.returns,
+            "env": base_env(model).save_state(),
+            "random": _random_state(),
+        }
+    )
+
+
+def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
+    """Set an untrained model with its environment, and the random generators, to the state of a checkpoint.
+
+    Raises:
+        DamagedRunError: the checkpoint is damaged or of an older version.
+        GymMaraError: the robot has changed since.
+    """
+    read_description(checkpoint).check(base_env(model).env.simulation)
+    if (checkpoint / _OLD_STATE_FILE).exists():
+        raise DamagedRunError(
+            f"the checkpoint {str(checkpoint)!r} is of an older version of gym_mara, which stored it as a pickle: "
+            "train the run again"
+        )
+    try:
+        state = decode(read_bytes(checkpoint / STATE_FILE, 4 * LARGEST))
+        return _restore(model, state)
+    except (
+        DamagedFileError,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise DamagedRunError(
+            f"the checkpoint {str(checkpoint)!r} is damaged ({error}); delete it to resume from the one before"
+        ) from error
+
+
+def _restore(model: OnPolicyAlgorithm, state: dict[str, Any]) -> Progress:
+    wrapped = normalisation(model)
+    model.set_parameters(state["parameters"], exact_match=True, device="cpu")
+    for name in _ATTRIBUTES:
+        setattr(model, name, state["attributes"][name])
+    for name, values in state["statistics"].items():
+        running: RunningMeanStd = getattr(wrapped, name)
+        if set(values) != set(vars(running)) or values["mean"].shape != running.mean.shape:
+            raise GymMaraError(f"the statistics {name!r} have another form")
+        vars(running).update(values)
+    wrapped.returns = state["returns"]
+    base_env(model).restore_state(state["env"])
+    _restore_random_state(state["random"])
+    return Progress(*map(float, state["progress"]))
+
+
+def _plain(value: Any) -> Any:
+    """Parameters with plain dicts in place of ordered ones, and tensors in place of parameters."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_plain(each) for each in value)
+    return value.detach() if isinstance(value, torch.Tensor) else value
+
+
+def _random_state() -> list[Any]:
+    """The state of every random generator that Stable-Baselines3 uses."""
+    return [random.getstate(), np.random.get_state(), torch.get_rng_state()]  # noqa: NPY002
+
+
+def _restore_random_state(state: list[Any]) -> None:
+    python_state, numpy_state, torch_state = state
+    random.setstate(python_state)
+    np.random.set_state(numpy_state)  # noqa: NPY002
+    torch.set_rng_state(torch_state)

@@ -1,0 +1,63 @@
+"""The commands and their errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from rich.text import Text
+from typer.core import TyperGroup
+
+from gym_mara.cli import FAILED, agents, environments, experiments, viewing
+from gym_mara.cli.common import err, interruptible
+from gym_mara.errors import GymMaraError
+
+# Some versions of Typer have a copy of Click, so Click's own class is not always theirs.
+_UsageError: Any = typer.BadParameter.__base__
+
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        with interruptible("Interrupted."):
+            return super().invoke(ctx)
+
+
+app = typer.Typer(
+    cls=_Commands,
+    help="Train, evaluate and guard agents for the robot arm MARA.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command()(agents.train)
+app.command()(agents.evaluate)
+app.command()(agents.transfer)
+app.command()(viewing.watch)
+app.command()(viewing.report)
+app.command()(experiments.benchmark)
+app.command()(experiments.plot)
+app.command()(experiments.search)
+app.command("list")(environments.list_)
+app.command()(environments.rewards)
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command and return its exit code; an error that the user can correct is one line on stderr."""
+    try:
+        code = app(arguments, prog_name="gym-mara", standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except GymMaraError as error:
+        return _failed(str(error))
+    except _UsageError as error:
+        if not arguments:  # Typer's way to show the help
+            error.show()
+            return FAILED
+        message = error.format_message()
+        if error.ctx and not isinstance(error, typer.BadParameter):
+            message = f"{message.rstrip('.?')}; see {error.ctx.command_path} --help"
+        return _failed(message)
+
+
+def _failed(message: str) -> int:
+    err.print(Text.assemble(("error: ", "bold red"), message), soft_wrap=True)
+    return FAILED

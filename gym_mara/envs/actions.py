@@ -1,0 +1,43 @@
+"""Checks that an action consists of joint targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gym_mara.errors import GymMaraError
+from gym_mara.types import UnitActions
+
+
+def joint_targets(action: ArrayLike) -> NDArray[Any]:
+    """Return an action as an array of integers or floats.
+
+    Raises:
+        GymMaraError: it has another type, is masked, or holds the `UnitActions` of a policy.
+    """
+    if type(action) is np.ndarray:
+        array = action
+    else:
+        for value in (action, *action) if isinstance(action, Sequence) else (action,):
+            if isinstance(value, UnitActions):
+                raise GymMaraError(
+                    "these actions are in [-1, 1], as the policy was trained; wrap the environment in "
+                    "gymnasium.wrappers.RescaleAction(env, -1, 1), or play the policy with "
+                    "gym_mara.agents.runs.load_policy"
+                )
+            if isinstance(value, np.ma.MaskedArray):
+                raise GymMaraError(
+                    "an action cannot be a masked array, because each joint needs a target; give an array without a mask"
+                )
+        try:
+            array = np.asarray(action)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise GymMaraError(f"an action must be an array of numbers: {error}") from error
+    if array.dtype.kind not in "fiu":
+        raise GymMaraError(
+            f"an action must be an array of integers or floats (joint targets, rad), not of {array.dtype}"
+        )
+    return array

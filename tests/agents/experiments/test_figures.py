@@ -1,0 +1,171 @@
+"""The files of a grid: what is damaged or hostile is refused, and a figure is replaced as a whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from gym_mara.agents.experiments.figures import _scale, plot_grid
+from gym_mara.agents.experiments.grid import Grid, Metrics, open_grid, read_result, valid_result
+from gym_mara.agents.runs.evaluation import METRICS
+from gym_mara.errors import GymMaraError
+
+GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096)
+POLICY = {
+    "position_error_mm": 1.0,
+    "angle_deg": 2.0,
+    "reward_per_step": 9.0,
+    "return": 100.0,
+    "collisions": 0.0,
+}
+RESULT: dict[str, Any] = {"last": POLICY, "best": POLICY, "steps_to_10_mm": None, "seconds": 3}
+PROGRESS = "time/total_timesteps,rollout/reward_per_step\n2048,1.0\n4096,9.9\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A finished grid."""
+    folder = tmp_path / "grid"
+    open_grid(folder, GRID)
+    for name in GRID.runs():
+        (folder / name).mkdir()
+        (folder / name / "progress.csv").write_text(PROGRESS)
+        (folder / name / "result.json").write_text(json.dumps(RESULT))
+    return folder
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """Files of this process may have at most 4,000 bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def names(folder: Path) -> set[str]:
+    """The names of the files of a folder."""
+    return {entry.name for entry in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"envs": ["../victim"]}, "unknown environment '../victim'"),
+        ({"envs": []}, "at least one environment"),
+        ({"envs": ["MARA-v0", "MARA-v0"]}, "each name once"),
+        ({"algos": "ppo"}, "algos: .*array|tuple"),
+        ({"algos": ["ppo/../ppo"]}, "unknown algorithm"),
+        ({"preset_name": "../tuned"}, "preset"),
+        ({"backend": "gazebo"}, "unknown backend"),
+        ({"seeds": 10**9}, "seeds must be at most 1,000, not 1000000000"),
+        ({"seeds": 1.5}, "seeds: .*integer"),
+        ({"steps": 10**400}, "steps must be at most"),
+        ({"steps": True}, "steps: .*integer"),
+        ({"checkpoint_every": 0}, "checkpoint_every must be"),
+        ({"presets": ["tuned"]}, "presets: .*object|dict"),
+        ({"presets": {"ppo": 1}}, "presets.ppo"),
+        ({"more": 1}, "more: Unexpected"),
+    ],
+)
+def test_a_hostile_grid_is_refused_and_nothing_is_written(
+    folder: Path, change: dict[str, Any], message: str
+) -> None:
+    file = folder / "grid.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    before = names(folder), names(folder.parent)
+    for use in (plot_grid, lambda folder: open_grid(folder, GRID)):
+        with pytest.raises(GymMaraError, match=message) as caught:
+            use(folder)
+        assert "grid.json" in str(caught.value)
+    assert (names(folder), names(folder.parent)) == before
+
+
+def test_a_pipe_or_a_link_to_a_device_is_no_grid(tmp_path: Path) -> None:
+    for make in (os.mkfifo, lambda file: os.symlink("/dev/zero", file)):
+        (folder := tmp_path / make.__name__).mkdir()
+        make(folder / "grid.json")
+        with pytest.raises(GymMaraError, match=r"grid.json.*not a plain file"):
+            plot_grid(folder)
+        with pytest.raises(GymMaraError, match=r"grid.json.*not a plain file"):
+            open_grid(folder, GRID)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (json.dumps({**RESULT, "seconds": "0.001"}), "seconds: .*number, not '0.001'"),
+        (json.dumps({**RESULT, "seconds": -1.0}), "seconds: .*greater"),
+        (json.dumps({**RESULT, "last": {**POLICY, "return": float("nan")}}), "last.return"),
+        (json.dumps({**RESULT, "best": {}}), "best.position_error_mm: Field required"),
+        (json.dumps({**RESULT, "steps_to_10_mm": 1.5}), "steps_to_10_mm"),
+        (json.dumps(RESULT)[:-9], "JSON"),
+        (100_000 * "[", "JSON"),
+        ("\x00", "JSON"),
+    ],
+)
+def test_a_damaged_result_is_named_and_never_averaged(
+    folder: Path, text: str, message: str
+) -> None:
+    file = folder / "MARA-v0_ppo_0" / "result.json"
+    file.write_text(text)
+    assert valid_result(file.parent) is None
+    with pytest.raises(GymMaraError, match=rf"MARA-v0_ppo_0/result.json.*{message}.*again"):
+        plot_grid(folder)
+
+
+def test_the_form_of_a_result_has_every_metric(folder: Path) -> None:
+    assert Metrics.__annotations__.keys() == set(METRICS)
+    assert read_result(folder / "MARA-v0_ppo_0") == RESULT
+
+
+def test_a_metric_that_a_task_does_not_measure_is_a_dash(folder: Path) -> None:
+    for name in GRID.runs():
+        unmeasured = {**RESULT, "last": {**POLICY, "position_error_mm": None}}
+        (folder / name / "result.json").write_text(json.dumps(unmeasured))
+    plot_grid(folder)
+    assert "| MARA-v0 | PPO | 1 | - | - |" in (folder / "table.md").read_text()
+
+
+def test_a_file_size_limit_leaves_the_old_figures(folder: Path, small_files: None) -> None:
+    (folder / "MARA-v0.png").write_text("old")
+    before = names(folder)
+    with pytest.raises(GymMaraError, match=r"cannot write .*MARA-v0.png.*File too large"):
+        plot_grid(folder)
+    assert (folder / "MARA-v0.png").read_text() == "old"
+    assert names(folder) == before
+
+
+def test_a_figure_never_follows_a_link_out_of_the_folder(folder: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    for name in ("MARA-v0.png", "table.md", "curves.csv"):
+        (folder / name).symlink_to(victim)
+    plot_grid(folder)
+    assert victim.read_text() == "mine"
+    assert not (folder / "MARA-v0.png").is_symlink()
+
+
+def test_curves_close_to_the_best_are_far_apart_in_the_figure() -> None:
+    axis = Figure().subplots()
+    assert "logarithmic" in _scale(axis, np.array([-2000.0, 20_410.0, 20_470.0]))
+    _, low, high, top = axis.transAxes.inverted().transform(
+        axis.transData.transform([(0.0, y) for y in (-2000.0, 20_410.0, 20_470.0, 20_475.0)])
+    )[:, 1]
+    assert 0.4 < low < high - 0.1
+    assert high < top
+
+
+def test_curves_far_from_the_best_fill_the_figure() -> None:
+    axis = Figure().subplots()
+    axis.plot([0.0, 1.0], [-2000.0, 1000.0])
+    assert _scale(axis, np.array([-2000.0, 1000.0])) == ""
+    assert axis.get_ylim()[1] < 1500.0
