@@ -103,11 +103,24 @@ def watch(
     backends = list(chosen) or [folder.config.backend]
     if video is not None:
         with interruptible("Interrupted; no video was written."):
-            film_run(folder, video, backends, options, which=policy, seconds=seconds, speed=speed)
+            film_run(
+                folder,
+                video,
+                backends,
+                options,
+                which=policy,
+                seconds=seconds,
+                speed=speed,
+                log=_print,
+            )
         out.print(str(video), soft_wrap=True)
         return
     with interruptible("Closed."):
-        watch_run(folder, backends[0], options, policy, speed)
+        watch_run(folder, backends[0], options, policy, speed, _print)
+
+
+def _print(note: str) -> None:
+    out.print(note, soft_wrap=True)
 
 
 def report(

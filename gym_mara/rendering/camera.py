@@ -17,6 +17,8 @@ AMBIENT, KEY, FILL = 0.40, 0.50, 0.18
 """Intensities of the ambient light, of the key light, and of the fill light at the camera."""
 SPECULAR = 0.12
 """The specular coefficient of surfaces."""
+_MARGIN = 0.08
+"""Around the scene, relative to its size in the picture."""
 TO_KEY_LIGHT: Floats = np.array([-0.25, -0.45, 1.0]) / np.linalg.norm([-0.25, -0.45, 1.0])
 """The unit vector towards the key light, in the world frame."""
 BACKGROUND: Colour = (0.94, 0.95, 0.96)
@@ -43,24 +45,44 @@ class Camera:
 
 
 def place_camera(scene: Scene, view: View, settings: RenderSettings) -> Camera:
-    """Place the camera and the floor. A named camera is placed so that it sees everything that moves in this view."""
-    lowest, highest = scene.bounds(view)
+    """Place the camera and the floor. A named camera is placed as near as it sees the whole scene in this view."""
+    points = scene.points(view)
+    lowest, highest = points.min(axis=0), points.max(axis=0)
     middle, radius = 0.5 * (lowest + highest), 0.5 * float(np.linalg.norm(highest - lowest))
-    ground, _ = scene.bounds(view, moving=False)
-    floor = np.array([middle[0], middle[1], min(0.0, ground[2])])
+    floor = np.array([middle[0], middle[1], lowest[2]])
     if isinstance(settings.camera, str):
         azimuth, elevation = np.radians(CAMERAS[settings.camera])
         flat = np.cos(elevation)
-        towards = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
-        aspect = min(1.0, settings.width / settings.height)
-        distance = 1.1 * radius / (np.sin(np.radians(VIEW_ANGLE / 2.0)) * aspect)
-        eye, at = middle + distance * np.array(towards), middle
+        towards = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+        eye = _fitted_eye(points, towards, settings)
+        at = eye - towards * ((eye - middle) @ towards)
     else:
         eye, at = (np.array(point) for point in settings.camera)
-    forwards = (at - eye) / np.linalg.norm(at - eye)
-    upright = abs(forwards[2]) < 0.98
-    up = np.array([0.0, 0.0, 1.0]) if upright else np.array([1.0, 0.0, 0.0])
-    return Camera(eye, at, up, floor, 6.0 * max(radius, 0.1))
+    towards = (eye - at) / np.linalg.norm(eye - at)
+    return Camera(eye, at, _up(towards), floor, 4.0 * radius)
+
+
+def _up(towards: Floats) -> Floats:
+    """The upward direction of the picture of a camera in this direction: z, or x if it looks up or down."""
+    return np.array([0.0, 0.0, 1.0]) if abs(towards[2]) < 0.98 else np.array([1.0, 0.0, 0.0])
+
+
+def _fitted_eye(points: Floats, towards: Floats, settings: RenderSettings) -> Floats:
+    """The nearest position of a camera that sees all points (V, 3), m, with a margin, if it looks against `towards` (3,).
+
+    A camera at the position (x, y, z) in its own axes sees a point (a, b, c) if a - x and x - a are at most t · (z - c), where t is
+    the tangent of half the angle of view; and so for b. Of each bound, the point with the highest a + t · c is the tightest.
+    """
+    across = np.cross(_up(towards), towards)
+    across /= np.linalg.norm(across)
+    axes = np.array([across, np.cross(towards, across), towards])
+    seen = points @ axes.T
+    vertical = np.tan(np.radians(VIEW_ANGLE / 2.0)) / (1.0 + _MARGIN)
+    tangents = np.array([vertical * settings.width / settings.height, vertical])
+    high = (seen[:, :2] + tangents * seen[:, 2:]).max(axis=0)
+    low = (-seen[:, :2] + tangents * seen[:, 2:]).max(axis=0)
+    distance = ((high + low) / (2.0 * tangents)).max()
+    return np.array([*(high - low) / 2.0, distance]) @ axes
 
 
 def floor_colour(distance: Floats) -> Floats:

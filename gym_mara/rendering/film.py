@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,12 +12,15 @@ import numpy as np
 
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
+from gym_mara.files import written_aside
 from gym_mara.rendering.renderer import Picture
 
-with needs("films", "render", "imageio", "imageio-ffmpeg"):
+with needs("films", "render", "imageio", "imageio-ffmpeg", "pillow"):
     import imageio.v2 as imageio
-    import imageio_ffmpeg  # noqa: F401 - imageio uses it to write MP4
+    import imageio_ffmpeg
+    from PIL import Image, ImageDraw, ImageFont
 
+_TEXT_COLOUR = (40, 44, 52)
 FORMATS = (".mp4", ".gif")
 HIGHEST_RATE = 50.0
 """The highest rate that every browser plays, also of a GIF, pictures per second."""
@@ -37,19 +41,31 @@ class Film:
 
     def __init__(self, path: Path, rate: float) -> None:
         check_film_path(path)
-        self._path = path
-        self._partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-        options: dict[str, Any] = {"fps": rate, "codec": "libx264", "macro_block_size": 2}
+        self._path, self._pictures = path, 0
+        self._options: dict[str, Any] = {"fps": rate, "codec": "libx264", "macro_block_size": 2}
         if path.suffix.lower() == ".gif":
-            options = {"duration": 1000.0 / rate, "loop": 0}
-        self._writer: Any = imageio.get_writer(self._partial, **options)
+            self._options = {"duration": 1000.0 / rate, "loop": 0}
 
     def add(self, picture: Picture) -> None:
-        """Add a picture (height, width, 3); all pictures must have the same size."""
+        """Add a picture (height, width, 3); all pictures must have the same size.
+
+        Raises:
+            GymMaraError: the file cannot be written.
+        """
         height, width = (side // 2 * 2 for side in picture.shape[:2])  # MP4 needs even sizes
-        self._writer.append_data(np.ascontiguousarray(picture[:height, :width]))
+        try:
+            self._writer.append_data(np.ascontiguousarray(picture[:height, :width]))
+        except OSError as error:  # that of FFmpeg has many lines
+            raise self._incomplete() from error
+        self._pictures += 1
 
     def __enter__(self) -> Film:
+        with ExitStack() as stack:
+            self._temporary = stack.enter_context(written_aside(self._path, new=True))
+            stack.push(self._check)
+            self._writer: Any = imageio.get_writer(self._temporary, **self._options)
+            stack.callback(self._writer.close)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
@@ -58,12 +74,22 @@ class Film:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        try:
-            self._writer.close()
-            if error is None:
-                os.replace(self._partial, self._path)
-        finally:
-            self._partial.unlink(missing_ok=True)
+        self._stack.__exit__(error_type, error, traceback)
+
+    def _check(self, error_type: type[BaseException] | None, *_: Any) -> None:
+        """Check that an MP4 file is complete: imageio does not tell when FFmpeg fails."""
+        if error_type is None and self._path.suffix.lower() == ".mp4":
+            try:
+                written, _seconds = imageio_ffmpeg.count_frames_and_secs(str(self._temporary))
+            except RuntimeError as error:
+                raise self._incomplete() from error
+            if written < self._pictures:
+                raise self._incomplete()
+
+    def _incomplete(self) -> GymMaraError:
+        return GymMaraError(
+            f"{str(self._path)!r} could not be written to its end: is the disk full?"
+        )
 
 
 def check_film_path(path: Path) -> None:
@@ -74,9 +100,18 @@ def check_film_path(path: Path) -> None:
     """
     if path.suffix.lower() not in FORMATS:
         raise unknown("format of a video", path.suffix, FORMATS)
-    if path.exists():
+    if os.path.lexists(path):
         raise GymMaraError(f"{str(path)!r} exists and is not overwritten: choose another name")
     if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise GymMaraError(
             f"{str(path)!r} cannot be written: {str(path.parent)!r} is not a writable folder"
         )
+
+
+def labelled(picture: Picture, text: str) -> Picture:
+    """A copy of a picture (height, width, 3) with a text at the top."""
+    image = Image.fromarray(picture)
+    size = max(10, picture.shape[0] // 22)
+    font, margin = ImageFont.load_default(size), size // 2
+    ImageDraw.Draw(image).text((margin, margin), text, fill=_TEXT_COLOUR, font=font)
+    return np.asarray(image)

@@ -103,14 +103,10 @@ class Scene:
             for part in self.parts
         ]
 
-    def bounds(self, view: View, *, moving: bool = True) -> tuple[Floats, Floats]:
-        """The lowest and the highest corner (3,), m, of the parts that move, or of all parts, and of the target."""
-        corners = [view.target_position[None].astype(np.float32)]
-        for part, placement in zip(self.parts, self.placements(view), strict=True):
-            if not part.marker and not (moving and part.fixed):
-                corners.append(part.placed(placement))
-        points = np.concatenate(corners)
-        return points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    def points(self, view: View) -> Floats:
+        """The vertices of all parts in the world frame (V, 3), m."""
+        pairs = zip(self.parts, self.placements(view), strict=True)
+        return np.concatenate([part.placed(placement) for part, placement in pairs], dtype=float)
 
 
 def _meshes_of(

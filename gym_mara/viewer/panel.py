@@ -48,11 +48,18 @@ class Panel:
         )
         with gui.add_folder("Joints, rad"):
             self.jogging = gui.add_checkbox("Jog", initial_value=False)
-            start = q.clip(self._low, self._high)
-            bounds = zip(simulation.robot.joint_names, self._low, self._high, start, strict=True)
+            # Rounded outwards, because a long number is cut off; `targets` clips to the true limits.
+            low, high = np.floor(1e3 * self._low) / 1e3, np.ceil(1e3 * self._high) / 1e3
+            bounds = zip(simulation.robot.joint_names, low, high, q.round(3), strict=True)
             self.sliders = [
-                gui.add_slider(name, low, high, step=_SLIDER_STEP, initial_value=float(value))
-                for name, low, high, value in bounds
+                gui.add_slider(
+                    name,
+                    float(lowest),
+                    float(highest),
+                    step=_SLIDER_STEP,
+                    initial_value=float(np.clip(value, lowest, highest)),
+                )
+                for name, lowest, highest, value in bounds
             ]
         # For each plot: the names of its values, their scale, and the handle.
         self._plots: list[tuple[list[str], float, Any]] = []
@@ -103,12 +110,15 @@ class Panel:
         self._history.append(shown)
 
     def _build_plots(self, shown: dict[str, float]) -> None:
-        """Add a plot of the reward and its terms, and a plot of the position error with a logarithmic axis."""
+        """Add a plot of the reward and its terms, and a plot of the position error with a logarithmic axis.
+
+        The error is in µm, because the browser shows at most three decimals at an axis.
+        """
         rewards = [name for name in shown if name.startswith("reward")]
         distance = [name for name in shown if name in ("position_error", "distance")][-1:]
         for title, names, scale, y in (
             ("Reward", rewards, 1.0, viser.uplot.Scale(auto=True)),
-            ("Position error, mm", distance, 1e3, viser.uplot.Scale(auto=True, distr=3)),
+            ("Position error, µm", distance, 1e6, viser.uplot.Scale(auto=True, distr=3)),
         ):
             if not names:
                 continue
@@ -119,8 +129,20 @@ class Panel:
                     for name, colour in zip(names, _COLOURS, strict=False)
                 ]
                 empty = tuple(np.ones(1) for _ in series)
+                no_ticks = viser.uplot.Axis_Ticks(show=False)
                 scales = {"x": viser.uplot.Scale(time=False, auto=True), "y": y}
-                plot = self._server.gui.add_uplot(empty, tuple(series), scales=scales, aspect=1.6)
+                plot = self._server.gui.add_uplot(
+                    empty,
+                    tuple(series),
+                    scales=scales,
+                    axes=(
+                        viser.uplot.Axis(ticks=no_ticks),
+                        viser.uplot.Axis(ticks=no_ticks, size=74),
+                    ),
+                    legend=viser.uplot.Legend(show=len(names) > 1, live=False),
+                    aspect=1.9,
+                    padding=(12, 8, 0, 0),  # pixels; else the highest label is cut off
+                )
             self._plots.append((names, scale, plot))
 
     def update(self, simulation: Simulation, *, follow: bool) -> None:
@@ -134,4 +156,4 @@ class Panel:
             q = simulation.observed(0).q[0].clip(self._low, self._high)
             for slider, value in zip(self.sliders, q, strict=True):
                 if abs(slider.value - value) > _SLIDER_STEP:
-                    slider.value = float(value)
+                    slider.value = round(float(value), 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -11,9 +12,13 @@ import numpy as np
 from gym_mara.agents.runs.evaluation import chose_robot, make_arms
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
+from gym_mara.backends import backend_settings
 from gym_mara.envs.simulation import Outcome
 from gym_mara.tasks import MAX_EPISODE_STEPS
 from gym_mara.types import Floats, Mask
+
+VELOCITY_LIMIT = "max_joint_velocity"
+"""The setting with which joints travel that would else teleport."""
 
 
 class Player:
@@ -61,6 +66,19 @@ class Player:
         outcome = self.env.simulation.outcome
         assert outcome is not None
         return outcome
+
+    @property
+    def velocity_limit(self) -> float | None:
+        """If the joints teleport, the value of VELOCITY_LIMIT with which they travel: the robot's lowest velocity limit, rad/s.
+
+        None if they do not teleport, or if the backend or the robot has no limit.
+        """
+        simulation = self.env.simulation
+        lowest = float(simulation.robot.velocity_limit.min())
+        limited = VELOCITY_LIMIT in backend_settings(simulation.backend_name)
+        if simulation.backend.teleports and limited and 0.0 < lowest < math.inf:
+            return lowest
+        return None
 
     def __enter__(self) -> Player:
         return self

@@ -8,8 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+<<<<<<< HEAD
+from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
+from gym_mara.agents.runs.evaluation import options_beyond_backend
+=======
 from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
+>>>>>>> main
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.envs.goal import GoalSettings
@@ -23,8 +28,6 @@ SETTLED = 0.005
 """An arm has settled at the target once its position error stays below this value, m."""
 HELD = 1.0
 """How long it must have stayed there at the end of an episode to count as settled, s."""
-_VELOCITY_LIMIT = "max_joint_velocity"
-"""The setting by which a backend whose joints teleport lets them travel."""
 
 
 class Transferred(NamedTuple):
@@ -81,8 +84,8 @@ def transfer(
         chosen = {key: value for key, value in given.items() if key in everywhere or key in known}
         row, velocity_limit = _play(run, name, of_env, chosen, episodes, which)
         rows.append(row)
-        if velocity_limit is not None and _VELOCITY_LIMIT in known:
-            limited = {**chosen, _VELOCITY_LIMIT: velocity_limit}
+        if velocity_limit is not None:
+            limited = {**chosen, VELOCITY_LIMIT: velocity_limit}
             rows.append(_play(run, name, of_env, limited, episodes, which)[0])
     return rows
 
@@ -106,13 +109,16 @@ def _play(
     episodes: int,
     which: str,
 ) -> tuple[Transferred, float | None]:
+<<<<<<< HEAD
+    """How a policy does on a backend; and the player's velocity limit."""
+    with Player(run, backend, {**of_env, **chosen}, which=which, episodes=episodes) as player:
+=======
     """How a policy does on a backend; and if the joints teleport, the robot's lowest velocity limit, rad/s."""
     options = with_options(of_env, chosen)
     with Player(run, backend, options, which=which, episodes=episodes) as player:
+>>>>>>> main
         played = roll_out(player)
-        simulation = player.env.simulation
-        robot = simulation.robot
-        teleports = simulation.backend.teleports
+        robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
     row = Transferred(
         backend=", ".join([backend, *(f"{key}={value}" for key, value in chosen.items())]),
         position_error_mm=1000.0 * played.position_error[-1],
@@ -123,7 +129,7 @@ def _play(
         highest_torque=np.abs(played.torque / robot.effort_limit).max(axis=(0, 2)),
         highest_velocity=np.abs(played.qd).max(axis=(0, 2)),
     )
-    return row, float(robot.velocity_limit.min()) if teleports else None
+    return row, velocity_limit
 
 
 def settling_time(error: Floats, period: float) -> Floats:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Player
+from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player
 from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path
+from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path, labelled
 from gym_mara.viewer import watch
 
 _STILL = 0.5
@@ -29,8 +30,11 @@ def film_run(
     seconds: float = 6.0,
     speed: float = 1.0,
     rate: float = HIGHEST_RATE,
+    log: Callable[[str], None] | None = None,
 ) -> None:
     """Film the start of an episode of a run's policy on each backend, side by side.
+
+    Joints that would teleport move at the robot's velocity limit, unless the run or the options have max_joint_velocity.
 
     Args:
         run: the run.
@@ -41,6 +45,7 @@ def film_run(
         seconds: length of the filmed part of the episode, s.
         speed: times real time.
         rate: highest number of pictures per second.
+        log: is called with a sentence about each backend whose joints get the velocity limit.
 
     Raises:
         GymMaraError: the file exists or cannot be written, the policy is missing or damaged, or a value is out of its range.
@@ -49,7 +54,7 @@ def film_run(
     with ExitStack() as stack:
         players = []
         for backend in backends:
-            settings = {**options_on(backend, run.config, options), "render_mode": "rgb_array"}
+            settings = _settings(run, backend, options, which, log) | {"render_mode": "rgb_array"}
             players.append(stack.enter_context(Player(run, backend, settings, which=which)))
         period = players[0].env.simulation.backend.control_period
         every = math.ceil(speed / period / rate)
@@ -65,15 +70,59 @@ def film_run(
 
 
 def _side_by_side(players: list[Player]) -> Any:
-    pictures = [player.env.render() for player in players]
-    return np.concatenate([picture[0] for picture in pictures if picture], axis=1)
+    """The players' pictures in one; if there are several, each with the name of its backend."""
+    pictures = [pictures[0] for player in players if (pictures := player.env.render())]
+    if len(players) > 1:
+        names = [player.env.simulation.backend_name for player in players]
+        pictures = [labelled(*pair) for pair in zip(pictures, names, strict=True)]
+    return np.concatenate(pictures, axis=1)
 
 
 def watch_run(
-    run: RunFolder, backend: str, options: dict[str, Any], which: str, speed: float
+    run: RunFolder,
+    backend: str,
+    options: dict[str, Any],
+    which: str,
+    speed: float,
+    log: Callable[[str], None] | None = None,
 ) -> None:
-    """Play a run's policy in the viewer, episode after episode, until the user interrupts."""
-    settings = options_on(backend, run.config, options)
+    """Play a run's policy in the viewer, episode after episode, until the user interrupts.
+
+    Args:
+        run: the run.
+        backend: the backend.
+        options: keyword arguments of the environment, in addition to those of the run.
+        which: the policy, "last" or "best".
+        speed: times real time.
+        log: as in `film_run`, which also tells how joints move that would teleport.
+
+    Raises:
+        GymMaraError: the policy is missing or damaged, a value is out of its range, or the viewer cannot open.
+    """
+    settings = _settings(run, backend, options, which, log)
     with Player(run, backend, settings, which=which) as player:
         act = player.act
     watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
+
+
+def _settings(
+    run: RunFolder,
+    backend: str,
+    options: dict[str, Any],
+    which: str,
+    log: Callable[[str], None] | None,
+) -> dict[str, Any]:
+    """The keyword arguments with which a run is shown on a backend."""
+    settings = options_on(backend, run.config, options)
+    if VELOCITY_LIMIT in settings:
+        return settings
+    with Player(run, backend, settings, which=which) as player:
+        limit = player.velocity_limit
+    if limit is None:
+        return settings
+    if log is not None:
+        log(
+            f"{backend}: shown with joints of at most {limit:.3g} rad/s, the robot's limit; "
+            f"to see them teleport, --set {VELOCITY_LIMIT}=null"
+        )
+    return settings | {VELOCITY_LIMIT: limit}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 import urllib.request
@@ -15,13 +17,14 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
-from gym_mara.agents.inspection.watch import film_run
+from gym_mara.agents.inspection.watch import film_run, watch_run
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film
 from tests.browser import chromium
-from tests.helpers import started
+from tests.helpers import robot_model, started
 
 # The libraries that read films leave pipes open.
 pytestmark = pytest.mark.filterwarnings(
@@ -67,9 +70,35 @@ def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path:
     film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
     shown = pictures(film)
     assert shown.shape[1:] == (120, 320, 3)
-    assert differing(shown[0, :, :160], shown[0, :, 160:]) < 0.001
-    arrived, travelling = shown[-1, :, :160], shown[-1, :, 160:]
-    assert differing(arrived, travelling) > 0.002
+    label, scene = np.s_[:18], np.s_[18:]
+    start = shown[0]
+    assert differing(start[label, :160], start[label, 160:]) > 0.01, "each side has its name"
+    assert differing(start[scene, :160], start[scene, 160:]) < 0.001
+    assert differing(shown[-1, scene, :160], shown[-1, scene, 160:]) > 0.0005
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The keyword arguments with which viewers would have been opened."""
+    opened: list[dict[str, Any]] = []
+    monkeypatch.setattr(
+        watch_module, "watch", lambda _task, _backend, keywords, *_, **__: opened.append(keywords)
+    )
+    return opened
+
+
+def test_joints_that_would_teleport_are_shown_travelling(
+    finished_run: RunFolder, tmp_path: Path, watched: list[dict[str, Any]]
+) -> None:
+    notes: list[str] = []
+    for backend, chosen in (("pinocchio", {}), ("pinocchio", {"max_joint_velocity": None})):
+        watch_run(finished_run, backend, chosen, "last", 1.0, notes.append)
+    watch_run(finished_run, "dart", {}, "last", 1.0, notes.append)
+    lowest = pytest.approx(robot_model("mara").velocity_limit.min())
+    assert watched == [{"max_joint_velocity": lowest}, {"max_joint_velocity": None}, {}]
+    film_run(finished_run, tmp_path / "a.gif", ["pinocchio"], SMALL, seconds=0.1, log=notes.append)
+    assert len(notes) == 2, "one line for each that is shown otherwise than it was trained"
+    assert "--set max_joint_velocity=null" in notes[0]
 
 
 @pytest.mark.slow
@@ -113,6 +142,39 @@ def test_an_interrupted_film_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_full_disk_ends_a_film_with_a_clear_error(tmp_path: Path, suffix: str) -> None:
+    film = tmp_path / f"film{suffix}"
+    code = (
+        "import resource, sys, numpy as np\n"
+        "from pathlib import Path\n"
+        "from gym_mara.errors import GymMaraError\n"
+        "from gym_mara.rendering.film import Film\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "rng = np.random.default_rng(0)\n"
+        "try:\n"
+        f"    with Film(Path({str(film)!r}), 25.0) as film:\n"
+        "        for _ in range(20): film.add(rng.integers(0, 256, (120, 160, 3), np.uint8))\n"
+        "except GymMaraError as error: print(error)\n"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+    )
+    assert str(film) in answer.stdout
+    assert len(answer.stdout.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "link"])
+def test_a_film_replaces_nothing(tmp_path: Path, kind: str) -> None:
+    film = tmp_path / "film.mp4"
+    make = {"pipe": os.mkfifo, "folder": os.mkdir, "link": lambda path: os.symlink("gone", path)}
+    make[kind](film)
+    with pytest.raises(GymMaraError, match="exists"):
+        Film(film, 25.0)
+    assert list(tmp_path.iterdir()) == [film]
 
 
 def test_a_film_with_an_odd_size_is_cropped(tmp_path: Path) -> None:
