@@ -29,8 +29,9 @@ def watch(
         env: the name of an environment.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad; it plays one episode after the other. None: the
-            user moves the joints with the sliders, from the home configuration, in one episode without an end.
+        policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad; it plays one
+            episode after the other. None: the user moves the joints with the sliders, from the home configuration, in one
+            episode without an end.
         speed: the speed of the simulation relative to real time.
         seed: the seed of the environment.
 
