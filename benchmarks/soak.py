@@ -11,6 +11,7 @@ first tenth warms up. It prints a Markdown page, and exits with 1 if something w
 from __future__ import annotations
 
 import argparse
+import copy
 import gc
 import pickle
 import sys
@@ -61,10 +62,18 @@ class Tally:
         self.wrong["other future"] += int(pickle.dumps(first) != pickle.dumps(again))
 
 
-def vector(seed: int, tally: Tally, *, backend: str, mode: AutoresetMode, **options: Any) -> None:
+def vector(
+    seed: int,
+    tally: Tally,
+    *,
+    backend: str,
+    mode: AutoresetMode,
+    name: str = "MARARandomTarget-v0",
+    **options: Any,
+) -> None:
     """Steps a vector environment, restores a snapshot, and steps again with the same actions."""
     envs: Any = gymnasium.make_vec(
-        "gym_mara/MARARandomTarget-v0",
+        f"gym_mara/{name}",
         num_envs=ARMS,
         backend=backend,
         autoreset_mode=mode,
@@ -88,12 +97,12 @@ def vector(seed: int, tally: Tally, *, backend: str, mode: AutoresetMode, **opti
 def _step_vector(envs: Any, action: Any, mode: AutoresetMode, tally: Tally) -> Any:
     observation, reward, terminated, truncated, _ = envs.step(action)
     tally.observe(envs.observation_space, observation, reward)
-    result = [observation.copy(), reward.copy(), terminated.copy(), truncated.copy()]
+    result = copy.deepcopy([observation, reward, terminated, truncated])
     ended = terminated | truncated
     if mode is AutoresetMode.DISABLED and ended.any():
         observation, _ = envs.reset(options={"reset_mask": ended})
         tally.observe(envs.observation_space, observation, reward)
-        result.append(observation.copy())
+        result.append(copy.deepcopy(observation))
     return result
 
 
@@ -179,6 +188,9 @@ def scenarios() -> dict[str, Callable[[int, Tally], None]]:
             found[f"{backend}, one {name}"] = partial(
                 single, name=f"gym_mara/{name}", backend=backend
             )
+        found[f"{backend}, {ARMS} arms of MARAGoal-v0"] = partial(
+            vector, backend=backend, mode=AutoresetMode.SAME_STEP, name="MARAGoal-v0"
+        )
         found[f"{backend}, three threads"] = partial(threads, backend=backend)
     same_step = AutoresetMode.SAME_STEP
     found["dart, two worker processes"] = partial(vector, backend="dart", mode=same_step, workers=2)
