@@ -13,11 +13,11 @@ demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under run
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
 
 test: $(READY) ## Run the tests, but for the slow ones.
-	$(BIN)/python -m pytest -n auto -m "not slow" $(TESTS)
+	$(BIN)/python -m pytest -n auto -m "not slow and not nightly" $(TESTS)
 
 test-slow: $(READY) ## Run the slow tests: long trainings, Chromium, the examples.
 	.ci/chromium
-	$(BIN)/python -m pytest -n auto -m slow
+	$(BIN)/python -m pytest -n auto -m "slow and not nightly"
 
 lint: $(READY) ## Check format, lint and types.
 	$(BIN)/ruff format --check .

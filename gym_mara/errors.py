@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 
 class GymMaraError(ValueError):
@@ -40,52 +39,149 @@ class TrainingDivergedError(GymMaraError):
     """A training stopped because its values are no longer finite."""
 
 
-def positive_number(name: str, value: Any, unit: str = "", *, or_zero: bool = False) -> float:
-    """Check that a value is a finite, positive number, or zero if `or_zero` is true, and return it as a float.
-
-    Raises:
-        GymMaraError: it is not.
-    """
-    if not isinstance(value, bool) and isinstance(value, numbers.Real):
-        number = float(value)
-        if 0.0 < number < math.inf or (or_zero and number == 0.0):
-            return number
-    allowed = "not negative" if or_zero else "positive"
-    raise GymMaraError(
-        f"{name} must be finite and {allowed}{f' ({unit})' if unit else ''}, not {value!r}"
-    )
+SMALLEST, LARGEST = 1e-9, 1e9
+"""The range of positive numbers without a range of their own: arithmetic with others keeps enough digits."""
+MOST_COUNTED = 2**53
+"""The largest whole number that float64, in which steps are counted, can represent together with all smaller ones."""
 
 
-def whole_number(name: str, value: Any, or_else: str = "") -> int:
-    """Check that a value is a whole number of at least 1, and return it as an int.
+def positive_number(
+    name: str,
+    value: Any,
+    unit: str = "",
+    *,
+    or_zero: bool = False,
+    at_least: float = SMALLEST,
+    at_most: float = LARGEST,
+    reason: str = "others lose the precision of the arithmetic",
+) -> float:
+    """Check that a value is a positive number within a range, or zero if `or_zero` is true, and return it as a float.
 
     Args:
         name: the name of the value, for the message.
-        value: the value.
-        or_else: another allowed value, for the message, such as ", or None for no limit".
+        value: the value: a number of Python or NumPy.
+        unit: its unit, for the message.
+        or_zero: whether zero is allowed.
+        at_least, at_most: the range of positive numbers.
+        reason: why others are not allowed, for the message.
 
     Raises:
         GymMaraError: it is not.
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
-        raise GymMaraError(f"{name} must be a whole number of at least 1{or_else}, not {value!r}")
-    return int(value)
+    plain, number = _plain(value), math.nan
+    if isinstance(plain, numbers.Real) and not isinstance(plain, bool):
+        try:
+            number = float(plain)
+        except OverflowError:
+            number = math.inf
+    if not (0.0 < number < math.inf or (or_zero and number == 0.0)):
+        allowed = f"finite and {'not negative' if or_zero else 'positive'}"
+    elif number > at_most:
+        allowed = f"at most {at_most:g}"
+    elif 0.0 < number < at_least:
+        allowed = f"at least {at_least:g}"
+    else:
+        return number
+    because = "" if "finite" in allowed else f", because {reason}"
+    in_units = f" ({unit})" if unit else ""
+    raise GymMaraError(f"{name} must be {allowed}{in_units}{because}, not {_shown(value)}")
 
 
-def finite_vector(name: str, values: Any, length: int | None = None) -> NDArray[np.float64]:
-    """Check that values are a list of finite numbers, of this length if one is given, and return them as a new array.
+def whole_number(
+    name: str,
+    value: Any,
+    *,
+    or_else: str = "",
+    at_most: int = MOST_COUNTED,
+    reason: str = "larger ones cannot be counted exactly",
+) -> int:
+    """Check that a value is a whole number from 1 to `at_most`, and return it as an int.
+
+    Args:
+        name: the name of the value, for the message.
+        value: the value: a whole number of Python or NumPy.
+        or_else: another allowed value, for the message, such as "None for no limit".
+        at_most: the largest number.
+        reason: why larger ones are not allowed, for the message.
+
+    Raises:
+        GymMaraError: it is not.
+    """
+    plain = _plain(value)
+    whole = isinstance(plain, numbers.Integral) and not isinstance(plain, bool)
+    number = int(plain) if whole else 0
+    if number < 1:
+        other = f", or {or_else}" if or_else else ""
+        raise GymMaraError(
+            f"{name} must be a whole number of at least 1{other}, not {_shown(value)}"
+        )
+    if number > at_most:
+        raise GymMaraError(
+            f"{name} must be at most {at_most}, because {reason}; not {_shown(value)}"
+        )
+    return number
+
+
+def flag(name: str, value: Any) -> bool:
+    """Check that a value is True or False, of Python or NumPy, and return it as a bool.
+
+    Raises:
+        GymMaraError: it is not.
+    """
+    plain = _plain(value)
+    if not isinstance(plain, (bool, np.bool_)):
+        raise GymMaraError(f"{name} must be True or False, not {_shown(value)}")
+    return bool(plain)
+
+
+def finite_numbers(name: str, values: Any, count: int | None = None) -> list[float]:
+    """Check that values are a list or array of finite numbers, and return them as floats.
+
+    Args:
+        name: the name of the values, for the message.
+        values: the values.
+        count: how many there must be; None for any number.
 
     Raises:
         GymMaraError: they are not.
     """
     try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise GymMaraError(f"{name} must be a list of numbers, not {values!r}") from error
-    if array.ndim != 1 or length not in (None, len(array)) or not np.isfinite(array).all():
-        count = f"{length} " if length else ""
-        raise GymMaraError(f"{name} must be a list of {count}finite numbers, not {values!r}")
-    return array
+        array = np.asarray(values)
+    except ValueError:  # lists of different lengths
+        array = np.array(None)
+    good = array.ndim == 1 and array.dtype.kind in "fiu" and count in (None, len(array))
+    if not (good and bool((np.abs(array.astype(np.float64)) <= LARGEST).all())):
+        many = f"{count} " if count else ""
+        raise GymMaraError(
+            f"{name} must be a list of {many}finite numbers, each within ±{LARGEST:g}, not {_shown(values)}"
+        )
+    return [float(value) for value in array]
+
+
+def one_of(kind: str, name: object, valid: Iterable[str]) -> str:
+    """Check that a name is one of the valid names, and return it.
+
+    Raises:
+        GymMaraError: it is not.
+    """
+    names = list(valid)
+    if not isinstance(name, str) or name not in names:
+        raise unknown(kind, name, names)
+    return str(name)
+
+
+def _shown(value: Any) -> str:
+    """The representation of a value, cut off if it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python does not print thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 200 else f"{text[:200]}…"
+
+
+def _plain(value: Any) -> Any:
+    """The number in an array without dimensions; any other value unchanged."""
+    return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
 def unknown(kind: str, name: object, valid: Iterable[str], where: str = "") -> GymMaraError:

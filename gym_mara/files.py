@@ -51,7 +51,9 @@ def read_bytes(file: Path, largest: int) -> bytes:
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode):
                 raise DamagedFileError(f"cannot read {str(file)!r}: it is not a plain file")
-            content = stream.read(largest + 1) if status.st_size <= largest else None
+            # Python allocates what it is asked for, so not more than the file seems to need.
+            expected = min(largest, max(status.st_size, 2**16))
+            content = stream.read(expected + 1) if status.st_size <= largest else None
     except FileNotFoundError:
         raise MissingFileError(f"cannot read {str(file)!r}: there is no such file") from None
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
@@ -63,6 +65,24 @@ def read_bytes(file: Path, largest: int) -> bytes:
             f"cannot read {str(file)!r}: it is larger than {largest:,} bytes, the most allowed"
         )
     return content
+
+
+def plain_size(file: Path) -> int:
+    """The size of a plain file, bytes, for a library that reads the file itself.
+
+    Raises:
+        MissingFileError: there is no such file.
+        DamagedFileError: it is not a plain file.
+    """
+    try:
+        status = os.stat(file)
+    except FileNotFoundError:
+        raise MissingFileError(f"cannot read {str(file)!r}: there is no such file") from None
+    except (OSError, ValueError) as error:
+        raise DamagedFileError(f"cannot read {str(file)!r}: {_reason(error)}") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise DamagedFileError(f"cannot read {str(file)!r}: it is not a plain file")
+    return status.st_size
 
 
 def read_text(file: Path, largest: int = LARGEST_TEXT) -> str:

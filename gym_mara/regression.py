@@ -21,10 +21,12 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from gym_mara.backends import DEFAULT_BACKEND, backend_settings
-from gym_mara.envs.options import Options
+from gym_mara.envs import make_vector_env
+from gym_mara.envs.goal import GoalSettings
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.files import DamagedFileError, parsed_json, read_text, short, write_text
+from gym_mara.registration import environment
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.robot.model import is_path
 from gym_mara.tasks import named_task
@@ -131,9 +133,9 @@ def _values(simulation: Simulation, q: Floats) -> dict[str, Floats]:
     unused = np.repeat(q[-1:], simulation.num_envs - len(q), axis=0)
     simulation.backend.reset(np.concatenate([q, unused]))
     state = simulation.backend.state
-    reward, terms = simulation.task.reward(state, simulation.goal)
-    values = {**terms, "collided": state.collided.astype(np.float64), "reward": reward}
-    return {name: column[: len(q)] for name, column in values.items()}
+    reward, terms = simulation.rewards(state)
+    values = {**terms, "collided": state.collided, "reward": reward}
+    return {name: column[: len(q)].astype(np.float64) for name, column in values.items()}
 
 
 def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Moved]:
@@ -270,8 +272,10 @@ def _check_tolerance(tolerance: float) -> None:
 
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
     """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
-    of_task = [field.name for field in dataclasses.fields(named_task(env))]  # type: ignore[arg-type]
-    known = {"robot", "ee_frame", *of_task, *backend_settings(backend)} - {"workers"}
+    made = environment(env)
+    forms: list[Any] = [named_task(made.task), *([GoalSettings] if made.goals else [])]
+    of_env = [field.name for form in forms for field in dataclasses.fields(form)]
+    known = {"robot", "ee_frame", *of_env, *backend_settings(backend)} - {"workers"}
     for name in options:
         if name not in known:
             raise unknown("keyword argument", name, known, " of a reward record")
@@ -280,9 +284,7 @@ def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
 def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
     """A simulation of N arms, from the keyword arguments of an environment."""
     _check_options(env, backend, options)
-    rest = {name: v for name, v in options.items() if name not in ("robot", "ee_frame")}
-    robot, ee_frame = options.get("robot", "mara"), options.get("ee_frame")
-    return Simulation(Options.sort(env, robot, ee_frame, backend, rest), num_envs)
+    return make_vector_env(env, num_envs, backend=backend, **options).simulation
 
 
 def _sample_q(simulation: Simulation, states: int) -> Floats:

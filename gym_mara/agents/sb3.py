@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from gym_mara.agents.scaling import Scaling, is_unit_box
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.options import check_reset_options
 from gym_mara.errors import GymMaraError
 from gym_mara.types import Floats, Mask, UnitActions
 
@@ -59,6 +60,8 @@ class MaraVecEnv(VecEnv):
         """The sum of all rewards since it was last set to zero."""
 
     def reset(self) -> Floats:
+        for options in self._options:
+            check_reset_options(options, [])
         seeds, self._returns = self._seeds, np.zeros(self.num_envs)
         observation, _ = self.env.reset(seed=seeds if seeds[0] is not None else None)
         self._reset_seeds()

@@ -25,6 +25,8 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms run faster in several processes: true for an engine that holds Python's lock while it steps."""
+    most_arms: ClassVar[int] = 2**20
+    """The largest number of arms: with more, an ordinary machine runs out of memory."""
     teleports: bool = False
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False
@@ -37,7 +39,14 @@ class Backend(ABC):
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
         self.robot = robot
         self.num_envs = num_envs
-        self.control_period = positive_number("control_period", control_period, "s")
+        self.control_period = positive_number(
+            "control_period",
+            control_period,
+            "s",
+            at_least=1e-6,
+            at_most=1e3,
+            reason="no arm is controlled at others",
+        )
         self.joint_velocity = robot.velocity_limit
 
     @abstractmethod
@@ -62,6 +71,9 @@ class Backend(ABC):
     @abstractmethod
     def save(self) -> dict[str, Any]:
         """A snapshot that pickles, and from which the simulation continues identically.
+
+        A training can store it if it consists of plain values, arrays, random generators (PCG64), and lists, tuples and
+        dicts of them.
 
         Where `in_processes` is true every value is an array, a list or a tuple with a row for each arm, or a dict of
         such values. Then a snapshot fits any number of processes.

@@ -61,7 +61,13 @@ class PinocchioBackend(Backend):
             velocity = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.max_joint_velocity = velocity
             self.joint_velocity = np.full(robot.num_joints, velocity)
-        self.path_resolution = positive_number("path_resolution", path_resolution, "m")
+        self.path_resolution = positive_number(
+            "path_resolution",
+            path_resolution,
+            "m",
+            at_least=1e-4,
+            reason="a path has a collision check for each, and all are computed at once",
+        )
         self._checker = make_checker(collision, robot, collision_threads)
         self._with_margin: CollisionChecker | None = None
         if self.max_joint_velocity is not None:

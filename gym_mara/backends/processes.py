@@ -108,7 +108,7 @@ class Workers:
             if isinstance(error, (EOFError, OSError)):
                 raise WorkerDiedError(
                     "a worker process of the simulation died (killed, or out of memory?); make a new environment, "
-                    "with fewer arms or workers if memory was short"
+                    "with fewer arms or workers if memory was short. If it printed an error, correct that first"
                 ) from error
             raise
 

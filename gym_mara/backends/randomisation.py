@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import LARGEST, SMALLEST, GymMaraError, finite_numbers, unknown
 from gym_mara.robot import RobotModel
 from gym_mara.types import Floats
 
@@ -68,14 +68,14 @@ class Randomisation:
 def _checked(name: str, ends: Any) -> tuple[float, float]:
     if name not in PARAMETERS:
         raise unknown("parameter of randomisation", name, PARAMETERS)
-    try:
-        low, high = (float(end) for end in ends)
-    except (TypeError, ValueError):
-        low = high = np.nan
     positive = PARAMETERS[name].positive
-    if not (0.0 <= low <= high < np.inf) or (positive and low == 0.0):
+    try:
+        low, high = finite_numbers(name, ends, 2)
+    except GymMaraError:
+        low = high = np.nan
+    if not 0.0 <= low <= high or (positive and low < SMALLEST):
         raise GymMaraError(
             f"randomisation of {name!r} must be (lowest, highest), in this order, finite and "
-            f"{'positive' if positive else 'not negative'}; not {ends!r}"
+            f"{f'at least {SMALLEST:g}' if positive else 'not negative'}, at most {LARGEST:g}; not {ends!r}"
         )
     return low, high

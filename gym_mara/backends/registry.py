@@ -8,7 +8,7 @@ from typing import Any
 
 from gym_mara.backends.base import Backend
 from gym_mara.backends.workers import WorkerBackend, choose_workers
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.robot import RobotModel
 
 
@@ -44,7 +44,7 @@ def backend_class(name: str) -> type[Backend]:
         BrokenBackendError: another package offers it, and it cannot be loaded.
         MissingExtraError: its engine is not installed.
     """
-    entry_point = _find(name)
+    entry_point = _find(name) if isinstance(name, str) else None
     if entry_point is None:
         raise unknown("backend", name, backend_names())
     try:
@@ -113,6 +113,12 @@ def make_backend(
         MissingExtraError: its engine is not installed.
     """
     backend, settings = backend_class(name), backend_settings(name)
+    num_envs = whole_number(
+        "num_envs",
+        num_envs,
+        at_most=backend.most_arms,
+        reason=f"the arms of the backend {name!r} take too much memory",
+    )
     for option in options:
         if option not in settings:
             raise unknown("keyword argument", option, settings, f" with backend {name!r}")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gym_mara.backends.base import Backend
-from gym_mara.errors import GymMaraError, positive_number, unknown
+from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import Contact, SimState
 from gym_mara.types import Floats, Mask
@@ -17,6 +17,8 @@ from gym_mara.types import Floats, Mask
 ON_DIVERGENCE = ("error", "truncate")
 DIVERGED_VELOCITY = 1e3
 """A joint this many times as fast as its limit has diverged."""
+MOST_PHYSICS_STEPS = 10_000
+"""The largest number of physics steps in a control period."""
 _STATE = ("q", "qd", "torque", "contacts", "time", "diverged", "parameters")
 
 
@@ -84,9 +86,7 @@ class ServoBackend(Backend):
             limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.joint_velocity = np.minimum(limit, robot.velocity_limit)
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
-        if on_divergence not in ON_DIVERGENCE:
-            raise unknown("on_divergence", on_divergence, ON_DIVERGENCE)
-        self.on_divergence = on_divergence
+        self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
         self._kinematics = robot.kinematics()
         shape = (num_envs, robot.num_joints)
         self._gain = np.full(shape, self.servo_gain)
@@ -202,8 +202,13 @@ def step_times(control_period: float, physics_step: float) -> Floats:
     """The times between the physics steps of a control period, from 0 to the period (K + 1,), s.
 
     Raises:
-        GymMaraError: a control period is not a whole number of physics steps.
+        GymMaraError: a control period is not a whole number of physics steps, or has too many.
     """
+    if control_period / physics_step > MOST_PHYSICS_STEPS:
+        raise GymMaraError(
+            f"a control period of {control_period:g} s must have at most {MOST_PHYSICS_STEPS} physics steps, because a step "
+            f"of the environment computes them all; with physics_step {physics_step:g} s it has {control_period / physics_step:g}"
+        )
     steps = round(control_period / physics_step)
     if steps < 1 or abs(steps * physics_step - control_period) > 1e-9:
         raise GymMaraError(

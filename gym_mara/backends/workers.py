@@ -30,20 +30,26 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
     Raises:
         GymMaraError: the arms cannot be shared out equally, or the program's main module lacks its guard.
     """
+    importing = getattr(multiprocessing.current_process(), "_inheriting", False)
+    if importing and workers != 1:
+        # A new process is importing the main module: without this error it would run the whole program again.
+        raise GymMaraError(
+            "the main module of the program makes an environment while a worker process imports it; "
+            "put what the program does under `if __name__ == '__main__':`, or give workers=1"
+        )
     if workers is not None:
-        workers = whole_number("workers", workers)
+        workers = whole_number(
+            "workers",
+            workers,
+            at_most=max(16, 4 * len(cores())),
+            reason="each is a process, and more than 4 for each core only take memory",
+        )
         if num_envs % workers:
             fitting = [str(n) for n in range(1, num_envs + 1) if num_envs % n == 0]
             raise GymMaraError(
                 f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
             )
         return workers
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        # A new process is importing the main module: without this error it would run the whole program again.
-        raise GymMaraError(
-            "the main module of the program makes an environment while a worker process imports it; "
-            "put what the program does under `if __name__ == '__main__':`, or give workers=1"
-        )
     if multiprocessing.parent_process() is not None or _in_ray_worker():
         return 1
     return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)

@@ -34,6 +34,7 @@ from gym_mara.cli.common import (
     whole,
 )
 from gym_mara.errors import GymMaraError
+from gym_mara.registration import file_name
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:
@@ -110,7 +111,9 @@ def train(
             env_options=keyword_arguments(settings),
         )
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = out_folder or Path("runs") / f"{algo}_{env}_{backend}_seed{seed}_{stamp}"
+        folder = (
+            out_folder or Path("runs") / f"{algo}_{file_name(env)}_{backend}_seed{seed}_{stamp}"
+        )
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress)
     _print_evaluation(run, episodes=1)

@@ -17,8 +17,8 @@ from gym_mara.backends import backend_names
 from gym_mara.cli import INTERRUPTED
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.extras import needs
+from gym_mara.registration import ENVIRONMENTS, environment_name
 from gym_mara.rendering import RenderSettings
-from gym_mara.tasks import TASKS
 
 _LARGEST_INTEGER = 2**63
 
@@ -80,12 +80,12 @@ def one_of(kind: str, names: Callable[[], Iterable[str]]) -> Callable[[str], str
     return parse
 
 
-def task_name(env: str) -> str:
-    """The name of a task, given with or without the namespace of its id."""
-    name = env.removeprefix("gym_mara:").removeprefix("gym_mara/")
-    if name not in TASKS:
-        raise typer.BadParameter(str(unknown("environment", env, TASKS)))
-    return name
+def env_name(env: str) -> str:
+    """The name of an environment, given with or without the namespace of its id."""
+    try:
+        return environment_name(env)
+    except GymMaraError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 def several(parse: Callable[[str], str]) -> Callable[[str], str]:
@@ -108,12 +108,14 @@ def names_in(option: str, values: Iterable[str]) -> tuple[str, ...]:
 algorithm_name = one_of("algorithm", lambda: ALGORITHMS)
 backend_name = one_of("backend", backend_names)
 
-SEVERAL = "Several are separated by commas."
 COUNT = whole(1, 10**12)
 EnvOption = Annotated[
     str,
     typer.Option(
-        "--env", parser=task_name, metavar="NAME", help="Environment: " + ", ".join(TASKS) + "."
+        "--env",
+        parser=env_name,
+        metavar="NAME",
+        help="Environment: " + ", ".join(ENVIRONMENTS) + ", or one of another package.",
     ),
 ]
 AlgoOption = Annotated[

@@ -28,16 +28,18 @@ from gym_mara.cli.common import (
     SeedsOption,
     StepsOption,
     algorithm_name,
+    env_name,
     interruptible,
     names_in,
     needs_agents,
     one_of,
     out,
     several,
-    task_name,
     whole,
 )
 from gym_mara.errors import GymMaraError, unknown
+from gym_mara.files import read_text
+from gym_mara.registration import file_name
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
@@ -60,7 +62,7 @@ def benchmark(
     env: Annotated[
         list[str],
         typer.Option(
-            parser=several(task_name),
+            parser=several(env_name),
             metavar="NAMES",
             help="Environments, separated by commas.",
         ),
@@ -149,7 +151,7 @@ def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.
 
     for file in plot_grid(folder):
         out.print(str(file), soft_wrap=True)
-    out.print((folder / "table.md").read_text(), soft_wrap=True)
+    out.print(read_text(folder / "table.md"), soft_wrap=True)
 
 
 def search(
@@ -180,7 +182,7 @@ def search(
 
     processes = _processes(jobs)
     wanted = module.Search(env, algo, steps, trials, seeds)
-    folder = out_folder or Path("runs") / f"search_{algo}_{env}"
+    folder = out_folder or Path("runs") / f"search_{algo}_{file_name(env)}"
     study = module.open_study(wanted, folder)
 
     def show_best() -> None:
@@ -258,7 +260,7 @@ class _GridView:
         seconds = time.monotonic() - self._started
         left = (total - done) * seconds / fresh if fresh else None
         title = f"{done / total:.0%} of {len(self._runs)} runs, {_clock(seconds)} so far"
-        table = Table("", *(a.upper() for a in self._grid.algos), title=title)
+        table = Table("", *(a.upper() for a in self._grid.algos), title=title, min_width=48)
         table.caption = f"{_clock(left)} left" if left else None
         for env in self._grid.envs:
             cells = (self._cell(env, algo) for algo in self._grid.algos)

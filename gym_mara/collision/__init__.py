@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gym_mara.collision.base import CollisionChecker, NoChecker
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, one_of, whole_number
 from gym_mara.robot import RobotModel
 
 __all__ = ["CollisionChecker", "make_checker"]
@@ -21,10 +21,13 @@ def make_checker(name: str, robot: RobotModel, threads: int = 1) -> CollisionChe
         GymMaraError: the name is unknown, or the engine does not support this number of threads.
         MissingExtraError: the engine is not installed.
     """
-    if threads < 1 or (threads > 1 and name != "coal"):
+    name = one_of("collision engine", name, ("coal", "fcl", "none"))
+    threads = whole_number(
+        "collision_threads", threads, at_most=256, reason="each thread has a copy of the robot"
+    )
+    if threads > 1 and name != "coal":
         raise GymMaraError(
-            f"collision_threads must be at least 1, and exactly 1 unless collision='coal'; "
-            f"not {threads} with {name!r}"
+            f"collision_threads must be 1 unless collision='coal'; not {threads} with {name!r}"
         )
     if name == "coal":
         from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
@@ -34,6 +37,4 @@ def make_checker(name: str, robot: RobotModel, threads: int = 1) -> CollisionChe
         from gym_mara.collision.fcl import FclChecker
 
         return FclChecker(robot)
-    if name == "none":
-        return NoChecker(robot)
-    raise unknown("collision engine", name, ("coal", "fcl", "none"))
+    return NoChecker(robot)

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import register
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
-from gym_mara.errors import GymMaraError, positive_number, whole_number
+from gym_mara.errors import GymMaraError, flag, positive_number, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.state import SimState
@@ -58,9 +58,11 @@ class GazeboMaraEnv(MaraEnv):
         original_observation: bool = False,
         **options: Any,
     ) -> None:
-        for flag, reason in _NO_MEANING.items():
-            if flag in options:
-                raise GymMaraError(f"{flag!r} has no meaning here: {reason}; leave it out")
+        for name, reason in _NO_MEANING.items():
+            if name in options:
+                raise GymMaraError(f"{name!r} has no meaning here: {reason}; leave it out")
+        gui, real_speed = flag("gui", gui), flag("real_speed", real_speed)
+        original_observation = flag("original_observation", original_observation)
         if velocity is not None and not real_speed:
             raise GymMaraError(
                 "'velocity' has no effect without real_speed: give real_speed=True too"

@@ -15,7 +15,7 @@ from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
-from gym_mara.errors import GymMaraError, positive_number, unknown
+from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
 from gym_mara.types import Floats, Mask
@@ -36,10 +36,9 @@ class GoalSettings:
     angle_tolerance: float
 
     def __post_init__(self) -> None:
-        if self.reward_type not in REWARD_TYPES:
-            raise unknown("reward_type", self.reward_type, REWARD_TYPES)
-        positive_number("position_tolerance", self.position_tolerance, "m")
-        positive_number("angle_tolerance", self.angle_tolerance, "rad")
+        one_of("reward_type", self.reward_type, REWARD_TYPES)
+        for name, unit in (("position_tolerance", "m"), ("angle_tolerance", "rad")):
+            object.__setattr__(self, name, positive_number(name, getattr(self, name), unit))
 
 
 class GoalSimulation(Simulation):

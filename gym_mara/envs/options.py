@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from gym_mara.backends import backend_settings
+from gym_mara.backends import backend_names, backend_settings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.rendering import RenderSettings
 from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import Task, named_task
-
-# Arguments of the environments that are not sorted, but valid as well.
-_OTHERS = ("backend", "ee_frame", "render_mode", "robot", "task")
 
 
 @dataclass(frozen=True)
@@ -39,6 +38,7 @@ class Options:
         ee_frame: str | None,
         backend: str,
         keywords: dict[str, Any],
+        receiver: type[object] | None = None,
     ) -> Options:
         """Assign each keyword argument to the part of the environment that knows its name.
 
@@ -48,6 +48,7 @@ class Options:
             ee_frame: the end-effector link of a URDF of your own.
             backend: the name of a backend.
             keywords: values of the task, and settings of the backend, the sensors and the rendering.
+            receiver: the class of the environment that received them, for the names in an error.
 
         Raises:
             GymMaraError: a name is unknown or belongs to two parts, or a value is out of its range.
@@ -64,8 +65,8 @@ class Options:
         for name, value in keywords.items():
             owners = [room for room, names in rooms.items() if name in names]
             if not owners:
-                valid = [*_OTHERS, *(name for names in rooms.values() for name in names)]
-                raise unknown("keyword argument", name, valid, f" with backend {backend!r}")
+                valid = {name for names in rooms.values() for name in names}
+                raise _unknown_keyword(name, valid | _own_names(receiver), backend)
             if len(owners) > 1:
                 raise GymMaraError(
                     f"the keyword argument {name!r} belongs to the {' and the '.join(owners)}: rename it in one of them"
@@ -79,6 +80,31 @@ class Options:
             sensors=SensorSettings(**own["sensors"]),
             rendering=RenderSettings(**own["rendering"]),
         )
+
+
+def _unknown_keyword(name: str, valid: set[str], backend: str) -> GymMaraError:
+    """The error for a keyword argument that no part of an environment knows."""
+    for other in backend_names():
+        if other == backend:
+            continue
+        with suppress(GymMaraError):  # a backend that is not installed
+            if name in backend_settings(other):
+                return GymMaraError(
+                    f"unknown keyword argument {name!r} with backend {backend!r}: it is a setting of the backend "
+                    f"{other!r}; pass backend={other!r}, or leave {name!r} out"
+                )
+    return unknown("keyword argument", name, valid, f" with backend {backend!r}")
+
+
+def _own_names(receiver: type[object] | None) -> set[str]:
+    """The named arguments of the constructors of an environment class of this package, and of its base classes."""
+    if receiver is None:
+        return {"backend", "ee_frame", "robot", "task"}
+    own = [
+        c for c in receiver.__mro__ if c.__module__.startswith("gym_mara") and "__init__" in vars(c)
+    ]
+    parameters = [p for c in own for p in inspect.signature(c).parameters.values()]
+    return {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
 
 
 def check_reset_options(options: Any, known: Sequence[str]) -> None:

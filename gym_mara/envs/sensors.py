@@ -28,7 +28,8 @@ class SensorSettings:
     """The time constant of the low-pass filter for measured velocities, s; 0 for no filter."""
 
     def __post_init__(self) -> None:
-        positive_number("velocity_filter", self.velocity_filter, "s", or_zero=True)
+        filtered = positive_number("velocity_filter", self.velocity_filter, "s", or_zero=True)
+        object.__setattr__(self, "velocity_filter", filtered)
 
 
 class Sensors:

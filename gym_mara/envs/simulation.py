@@ -19,7 +19,7 @@ from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
-from gym_mara.errors import GymMaraError, finite_vector, whole_number
+from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
@@ -59,7 +59,7 @@ class Simulation:
     def __init__(self, options: Options, num_envs: int) -> None:
         self.num_envs = whole_number("num_envs", num_envs)
         self.task, self.robot = options.task, options.robot
-        self._options = options
+        self.options = options
         self.backend_name = options.backend
         self.backend = make_backend(options.backend, self.robot, self.num_envs, options.settings)
         self._workspace = RobotWorkspace(self.robot)
@@ -160,6 +160,10 @@ class Simulation:
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
 
+    def rewards(self, state: SimState) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        """The rewards (N,) of a state without sensor noise, and their terms."""
+        return self._reward(state, self._observe(state, None))
+
     def _reward(
         self, state: SimState, observation: Floats
     ) -> tuple[Floats, dict[str, NDArray[Any]]]:
@@ -183,13 +187,13 @@ class Simulation:
         Raises:
             GymMaraError: a value has another shape or is not finite, or the quaternion is zero. The goal stays then.
         """
-        place = finite_vector("position", position, 3)
-        turn = finite_vector("quaternion", quaternion, 4)
+        point = finite_numbers("position", position, 3)
+        turn = np.array(finite_numbers("quaternion", quaternion, 4))
         if not np.linalg.norm(turn) > 1e-6:
             raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
         turn = rotations.canonical(rotations.normalised(turn))
         shape = (self.num_envs, 1)
-        self.goal = Goal(np.tile(place, shape), np.tile(turn, shape))
+        self.goal = Goal(np.tile(point, shape), np.tile(turn, shape))
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.
@@ -202,7 +206,7 @@ class Simulation:
         """
         self._check_open()
         known = backend_settings(name)
-        settings = {key: v for key, v in self._options.settings.items() if key in known}
+        settings = {key: v for key, v in self.options.settings.items() if key in known}
         backend = make_backend(name, self.robot, self.num_envs, settings)
         everyone = np.ones(self.num_envs, np.bool_)
         if backend.random:
@@ -227,7 +231,7 @@ class Simulation:
             self.num_envs,
             backend.control_period,
             backend.joint_velocity,
-            self._options.sensors,
+            self.options.sensors,
         )
 
     def _observe(self, state: SimState, noise: Floats | None) -> Floats:

@@ -17,7 +17,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.time_limits import TimeLimits
 from gym_mara.envs.view import view_of
-from gym_mara.errors import unknown
+from gym_mara.errors import one_of
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import Task
@@ -61,7 +61,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         **options: Any,
     ) -> None:
         self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
-        self._options = Options.sort(task, robot, ee_frame, backend, options)
+        self._options = Options.sort(task, robot, ee_frame, backend, options, type(self))
         self.simulation = self._make_simulation(self._options)
         self._pictures = Pictures(self.simulation.robot, self._options.rendering)
         self.viewer: Viewer | None = None
@@ -170,9 +170,7 @@ def checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | 
     Raises:
         GymMaraError: it is unknown.
     """
-    if render_mode is not None and render_mode not in known:
-        raise unknown("render_mode", render_mode, known)
-    return render_mode
+    return None if render_mode is None else one_of("render_mode", render_mode, known)
 
 
 def _info_of_one(values: dict[str, NDArray[Any]]) -> dict[str, Any]:

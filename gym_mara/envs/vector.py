@@ -61,9 +61,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
         if max_episode_steps is not None:
             max_episode_steps = whole_number(
-                "max_episode_steps", max_episode_steps, ", or None for no limit"
+                "max_episode_steps", max_episode_steps, or_else="None for no limit"
             )
-        sorted_options = Options.sort(task, robot, ee_frame, backend, options)
+        sorted_options = Options.sort(task, robot, ee_frame, backend, options, type(self))
         self.simulation = self._make_simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
         self.single_observation_space = self.simulation.observation_space

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.errors import GymMaraError, one_of, unknown, whole_number
 
 RENDERERS = ("vtk", "raycast")
 """In the order of preference."""
@@ -44,10 +44,14 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         for name, highest in _HIGHEST.items():
-            if whole_number(name, getattr(self, name)) > highest:
-                raise GymMaraError(f"{name} must be at most {highest}, not {getattr(self, name)}")
-        if self.renderer not in (None, *RENDERERS):
-            raise unknown("renderer", self.renderer, RENDERERS)
+            port = name == "viewer_port"
+            reason = "ports end there" if port else "larger pictures take too much memory and time"
+            value = whole_number(name, getattr(self, name), at_most=highest, reason=reason)
+            object.__setattr__(self, name, value)
+        if self.renderer is not None:
+            one_of("renderer", self.renderer, RENDERERS)
+        if not isinstance(self.viewer_host, str):
+            raise GymMaraError(f"viewer_host must be an address as text, not {self.viewer_host!r}")
         if not isinstance(self.camera, str):
             object.__setattr__(self, "camera", _two_points(self.camera))
         elif self.camera not in CAMERAS:
@@ -57,7 +61,7 @@ class RenderSettings:
 def _two_points(camera: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
     try:
         points = np.asarray(camera, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = np.empty(0)
     if points.shape != (2, 3) or not np.isfinite(points).all() or (points[0] == points[1]).all():
         raise GymMaraError(

@@ -13,13 +13,13 @@ from typing import Any, TypeGuard
 import numpy as np
 import pinocchio as pin
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.urdf import build, ee_frame_among_links, make_chain, visual_geometry
+from gym_mara.robot.urdf import build, check_urdf, ee_frame_among_links, make_chain, visual_geometry
 from gym_mara.types import Floats
 
 
@@ -70,6 +70,8 @@ class RobotModel:
             GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
             MissingExtraError: the robot's files come with a package that is not installed.
         """
+        if ee_frame is not None and not isinstance(ee_frame, str):
+            raise GymMaraError(f"ee_frame must be the name of a link, not {ee_frame!r}")
         if isinstance(robot, RobotModel):
             return robot
         if isinstance(robot, (list, tuple)):
@@ -162,6 +164,7 @@ class RobotModel:
         srdf: Path | None,
         modules: tuple[str, ...] = (),
     ) -> RobotModel:
+        check_urdf(urdf, root)
         chain = make_chain(urdf, root, ee_frame)
         xml = ElementTree.tostring(root, encoding="unicode")
         model, geometry = build(urdf, xml)
@@ -253,7 +256,7 @@ class RobotModel:
         Raises:
             GymMaraError: it has the wrong length, is not finite or is beyond a joint's limits.
         """
-        array = np.array(q, dtype=np.float64)
+        array = np.array(finite_numbers(what, q))
         if array.shape != (self.num_joints,):
             raise GymMaraError(
                 f"{what} has shape {array.shape}; {self.name} needs {(self.num_joints,)}"

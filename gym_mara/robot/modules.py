@@ -20,6 +20,7 @@ from gym_mara.robot.srdf import read_xml
 from gym_mara.types import Floats
 
 FEWEST_JOINTS, MOST_JOINTS = 3, 7
+MOST_MODULES = 50
 EE_FRAME = "ee_link"
 
 
@@ -66,8 +67,12 @@ def compose(mara: Path, names: Sequence[str]) -> ElementTree.Element:
         names: the modules from the base to the tool, keys of `MODULES`.
 
     Raises:
-        GymMaraError: a name is unknown, two faces do not fit, or the arm has too few or too many joints.
+        GymMaraError: a name is unknown, two faces do not fit, or the arm has too few or too many joints or modules.
     """
+    if len(names) > MOST_MODULES:
+        raise GymMaraError(
+            f"an arm must have at most {MOST_MODULES} modules, which is more than {MOST_JOINTS} joints need; not {len(names)}"
+        )
     modules = _oriented(names)
     source = read_xml(mara, "URDF")
     links = {link.get("name"): link for link in source.iter("link")}

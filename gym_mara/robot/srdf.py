@@ -21,6 +21,10 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
+from gym_mara.files import LARGEST_TEXT, read_bytes
+
+_DEEPEST = 100
+"""Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
 
 
 class Pose(NamedTuple):
@@ -131,12 +135,23 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     Raises:
         GymMaraError: the file is missing, is not XML, or describes no robot.
     """
+    content = read_bytes(path, LARGEST_TEXT)
     try:
-        root = ElementTree.parse(path).getroot()
-    except OSError as error:
-        raise GymMaraError(f"cannot read the {kind} {str(path)!r}: {error.strerror}") from error
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        root = ElementTree.fromstring(content)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
         raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
+    if _depth(root) > _DEEPEST:
+        raise GymMaraError(
+            f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
+        )
     if root.tag != "robot":
         raise GymMaraError(f"{str(path)!r} is not a {kind}: its root is <{root.tag}>, not <robot>")
     return root
+
+
+def _depth(root: ElementTree.Element) -> int:
+    """How deep the elements are nested; at most one more than allowed."""
+    level, depth = [root], 0
+    while level and depth <= _DEEPEST:
+        level, depth = [child for element in level for child in element], depth + 1
+    return depth

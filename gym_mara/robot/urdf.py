@@ -15,10 +15,85 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
+from gym_mara.files import plain_size, short
+
+# More than any robot has; the number of pairs of shapes grows with the square.
+_MOST = {"link": 1000, "joint": 1000, "collision": 500}
+_MOST_IN_CHAIN = 100
+_LARGEST_NUMBER = 1e12
+"""Of a URDF: the products of larger ones may overflow."""
+_LARGEST_MESHES = 2**30
+"""The size of all mesh files of a robot together, bytes."""
+_ANY, _NOT_NEGATIVE = -_LARGEST_NUMBER, 0.0
+# Element → attribute → the least value of its numbers.
+_NUMBERS: dict[str, dict[str, float]] = {
+    "origin": {"xyz": _ANY, "rpy": _ANY},
+    "axis": {"xyz": _ANY},
+    "limit": {"lower": _ANY, "upper": _ANY, "effort": _NOT_NEGATIVE, "velocity": _NOT_NEGATIVE},
+    "box": {"size": _NOT_NEGATIVE},
+    "sphere": {"radius": _NOT_NEGATIVE},
+    "cylinder": {"radius": _NOT_NEGATIVE, "length": _NOT_NEGATIVE},
+    "capsule": {"radius": _NOT_NEGATIVE, "length": _NOT_NEGATIVE},
+    "mesh": {"scale": _ANY},
+    "mass": {"value": _NOT_NEGATIVE},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), _ANY),
+}
+_COUNT = {"xyz": 3, "rpy": 3, "size": 3, "scale": 3}
+"""How many numbers an attribute has; the others have one."""
+
+
+def check_urdf(urdf: Path, root: ElementTree.Element) -> None:
+    """Check a URDF before Pinocchio reads it: how much it holds, its numbers, and its mesh files.
+
+    Raises:
+        GymMaraError: there are too many links or shapes, a number is not finite or out of range, or a mesh is not a plain
+            file or too large.
+    """
+    for tag, most in _MOST.items():
+        found = sum(1 for _ in root.iter(tag))
+        if found > most:
+            raise GymMaraError(
+                f"{str(urdf)!r} has {found:,} elements <{tag}>; at most {most:,} are allowed"
+            )
+    for part in root:
+        if part.tag in ("link", "joint"):
+            for element in part.iter():
+                for name, least in _NUMBERS.get(element.tag, {}).items():
+                    text = element.get(name)
+                    if text is not None and not _is_number(text, name, least):
+                        raise GymMaraError(
+                            f"{str(urdf)!r}: <{element.tag}> of {part.tag} {part.get('name')!r} has {name}={short(text)}; "
+                            f"{_COUNT.get(name, 1)} finite number(s) from {least:g} to {_LARGEST_NUMBER:g} are allowed"
+                        )
+    names = {mesh.get("filename", "") for mesh in root.iter("mesh")} - {""}
+    files = (file for name in names for file in _mesh_files(urdf, name))
+    if sum(map(plain_size, files)) > _LARGEST_MESHES:
+        raise GymMaraError(
+            f"the meshes of {str(urdf)!r} are larger than {_LARGEST_MESHES:,} bytes together"
+        )
+
+
+def _is_number(text: str, name: str, least: float) -> bool:
+    """Whether the value of an attribute has as many numbers as it must have, from `least` to the largest allowed."""
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        return False
+    return len(numbers) == _COUNT.get(name, 1) and all(
+        least <= number <= _LARGEST_NUMBER for number in numbers
+    )
+
+
+def _mesh_files(urdf: Path, name: str) -> list[Path]:
+    """The existing files that the name of a mesh may mean."""
+    rest = name.split("://", 1)[-1]
+    places = [Path(folder) / rest for folder in _package_folders(urdf)]
+    return [place for place in {Path(rest), *places} if os.path.lexists(place)]
 
 
 def ee_frame_among_links(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
@@ -57,7 +132,9 @@ def make_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str
         joints[child.get("link")] = (joint, parent.get("link"))
     chain: list[str] = []
     link: str | None = ee_frame
+    passed = []
     while link in joints:
+        passed.append(link)
         joint, link = joints.pop(link)
         kind = "mimic" if joint.find("mimic") is not None else joint.get("type")
         if kind == "continuous":
@@ -68,14 +145,38 @@ def make_chain(urdf: Path, root: ElementTree.Element, ee_frame: str) -> list[str
                 f"is {kind}; only revolute, continuous, prismatic and fixed joints may lead there"
             )
         if kind != "fixed":
+            _check_motion(urdf, joint)
             chain.insert(0, joint.get("name", ""))
+    if link in passed:
+        raise GymMaraError(
+            f"{str(urdf)!r}: the joints that lead to {ee_frame!r} form a loop at {link!r}"
+        )
     if not chain:
         raise GymMaraError(
             f"{str(urdf)!r}: no moving joint leads to {ee_frame!r}; name a link that the arm moves"
         )
+    if len(chain) > _MOST_IN_CHAIN:
+        raise GymMaraError(
+            f"{str(urdf)!r}: {len(chain)} joints lead to {ee_frame!r}; at most {_MOST_IN_CHAIN} are allowed"
+        )
     for joint, _ in joints.values():
         joint.set("type", "fixed")
     return chain
+
+
+def _check_motion(urdf: Path, joint: ElementTree.Element) -> None:
+    """Raises GymMaraError if a joint has no direction, or its limits are in the wrong order."""
+    axis, limit = joint.find("axis"), joint.find("limit")
+    if axis is not None and not any(float(x) for x in axis.get("xyz", "1").split()):
+        raise GymMaraError(
+            f"{str(urdf)!r}: the axis of joint {joint.get('name')!r} has length zero"
+        )
+    if limit is not None:
+        lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+        if lower > upper:
+            raise GymMaraError(
+                f"{str(urdf)!r}: joint {joint.get('name')!r} has the lower limit {lower:g}, above its upper limit {upper:g}"
+            )
 
 
 def _make_revolute(joint: ElementTree.Element) -> None:
@@ -112,15 +213,30 @@ def visual_geometry(urdf: Path, text: str, model: pin.Model) -> pin.GeometryMode
 
 
 def _geometry(urdf: Path, model: pin.Model, text: str, kind: pin.GeometryType) -> pin.GeometryModel:
-    # Meshes are often named package://…; the package may be any folder above the URDF.
+    folders = _package_folders(urdf)
+    geometry = pin.buildGeomFromUrdfString(model, text, kind, package_dirs=folders)
+    for geometry_object in geometry.geometryObjects:
+        shape = geometry_object.geometry
+        if isinstance(shape, coal.BVHModelBase) and not np.isfinite(shape.vertices()).all():
+            raise GymMaraError(
+                f"the mesh {geometry_object.meshPath!r} has a vertex that is not finite"
+            )
+    return geometry
+
+
+def _package_folders(urdf: Path) -> list[str]:
+    """Where meshes are: they are often named package://…, and the package may be any folder above the URDF."""
     ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
-    folders = [str(parent) for parent in urdf.absolute().parents] + ros_path
-    return pin.buildGeomFromUrdfString(model, text, kind, package_dirs=folders)
+    return [str(parent) for parent in urdf.absolute().parents] + ros_path
 
 
 @contextmanager
 def _named_in_errors(urdf: Path) -> Iterator[None]:
     try:
         yield
+    except GymMaraError:
+        raise
     except (OSError, ValueError, RuntimeError) as error:
-        raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {error}") from error
+        # Coal's errors begin with lines about its own source code.
+        reason = " ".join(str(error).rpartition("message:")[2].split())
+        raise GymMaraError(f"Pinocchio cannot load the URDF {str(urdf)!r}: {reason}") from error

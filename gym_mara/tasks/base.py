@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
-from gym_mara.errors import finite_vector, unknown
+from gym_mara.errors import finite_numbers, one_of
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
@@ -55,8 +55,7 @@ class Task(ABC):
     """The start configuration (J,), rad (m for a prismatic joint); None for the robot's home configuration."""
 
     def __post_init__(self) -> None:
-        if self.on_collision not in ON_COLLISION:
-            raise unknown("on_collision", self.on_collision, ON_COLLISION)
+        one_of("on_collision", self.on_collision, ON_COLLISION)
         self._make_plain("start_q", None)
 
     def _make_plain(self, name: str, length: int | None) -> None:
@@ -64,8 +63,7 @@ class Task(ABC):
         values = getattr(self, name)
         if values is None:
             return
-        array = finite_vector(name, values, length)
-        object.__setattr__(self, name, tuple(array.tolist()))
+        object.__setattr__(self, name, tuple(finite_numbers(name, values, length)))
 
     @abstractmethod
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gym_mara import rotations
-from gym_mara.errors import GymMaraError, positive_number
+from gym_mara.errors import GymMaraError, flag, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
 from gym_mara.tasks.base import Task, Workspace
@@ -28,6 +28,15 @@ _TARGETS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 # The arm must be able to reach a target within this distance (m) and angle (rad), otherwise there is a warning.
 _REACH_TOLERANCE = (1e-3, 1e-2)
+# The smallest and the largest positive value of each constant of the reward, and whether it can be zero.
+_RANGES = {
+    "alpha": (1e-3, 1e3, False),
+    "beta": (1e-3, 1e2, False),
+    "gamma": (1e-9, 1e6, True),
+    "delta": (1e-9, 1e6, True),
+    "eta": (1e-9, 1e3, True),
+    "kappa": (1e-3, 1e3, False),
+}
 # Arrays, because a NumPy ufunc on one row takes twice as long with a Python number.
 _ONE, _RMS = np.array(1.0), np.array(3.0**-0.5)
 
@@ -60,8 +69,7 @@ class ReachTask(Task):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("orientation", "collision_penalty"):
-            if not isinstance(getattr(self, name), bool):
-                raise GymMaraError(f"{name} must be True or False, not {getattr(self, name)!r}")
+            object.__setattr__(self, name, flag(name, getattr(self, name)))
         self._make_plain("target_position", 3)
         self._make_plain("target_quaternion", 4)
         quaternion = self.target_quaternion
@@ -70,9 +78,16 @@ class ReachTask(Task):
                 f"target_quaternion {quaternion} has length {np.linalg.norm(quaternion):.4f}; "
                 "give a unit quaternion [w, x, y, z]"
             )
-        for name in ("alpha", "beta", "gamma", "delta", "eta", "kappa"):
-            or_zero = name in ("gamma", "delta", "eta")
-            positive_number(name, getattr(self, name), or_zero=or_zero)
+        for name, (low, high, or_zero) in _RANGES.items():
+            value = positive_number(
+                name,
+                getattr(self, name),
+                or_zero=or_zero,
+                at_least=low,
+                at_most=high,
+                reason="the reward is not accurate with others",
+            )
+            object.__setattr__(self, name, value)
 
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
         """The target pose of each arm; warns if a target that the user gave is out of reach."""

@@ -7,20 +7,18 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from gym_mara.envs.options import Options
-from gym_mara.envs.simulation import Simulation
+from gym_mara.envs import make_vector_env
 from gym_mara.envs.streams import Streams
-from gym_mara.tasks import MAX_EPISODE_STEPS
-from gym_mara.types import Floats
+from gym_mara.registration import environment
 
 __all__ = ["watch"]
 
 
 def watch(
-    task: str,
+    env: str,
     backend: str,
     keywords: dict[str, Any],
-    policy: Callable[[Floats], ArrayLike] | None = None,
+    policy: Callable[[Any], ArrayLike] | None = None,
     *,
     speed: float = 1.0,
     seed: int | None = None,
@@ -28,10 +26,10 @@ def watch(
     """Open a viewer and step an environment until the user interrupts with Ctrl+C.
 
     Args:
-        task: the name of a task.
+        env: the name of an environment.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: maps observations (1, O) to joint targets (1, J), rad; it plays one episode after the other. None: the
+        policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad; it plays one episode after the other. None: the
             user moves the joints with the sliders, from the home configuration, in one episode without an end.
         speed: the speed of the simulation relative to real time.
         seed: the seed of the environment.
@@ -42,17 +40,14 @@ def watch(
     """
     from gym_mara.viewer.viewer import Viewer
 
-    rest = {name: value for name, value in keywords.items() if name not in ("robot", "ee_frame")}
-    robot, ee_frame = keywords.get("robot", "mara"), keywords.get("ee_frame")
-    options = Options.sort(task, robot, ee_frame, backend, rest)
-    simulation = Simulation(options, 1)
+    simulation = make_vector_env(env, 1, backend=backend, **keywords).simulation
     viewer: Viewer | None = None
     try:
         simulation.streams = (Streams.seeded(seed),)
-        viewer = Viewer(simulation, options.rendering)
+        viewer = Viewer(simulation, simulation.options.rendering)
         viewer.set_speed(speed)
         if policy is not None:
-            viewer.run(policy, MAX_EPISODE_STEPS)
+            viewer.run(policy, environment(env).max_episode_steps)
         else:
             viewer.jog()
             home = simulation.robot.home[None]

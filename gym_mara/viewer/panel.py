@@ -110,12 +110,15 @@ class Panel:
         self._history.append(shown)
 
     def _build_plots(self, shown: dict[str, float]) -> None:
-        """Add a plot of the reward and its terms, and a plot of the position error with a logarithmic axis."""
+        """Add a plot of the reward and its terms, and a plot of the position error with a logarithmic axis.
+
+        The error is in µm, because the browser shows at most three decimals at an axis.
+        """
         rewards = [name for name in shown if name.startswith("reward")]
         distance = [name for name in shown if name in ("position_error", "distance")][-1:]
         for title, names, scale, y in (
             ("Reward", rewards, 1.0, viser.uplot.Scale(auto=True)),
-            ("Position error, mm", distance, 1e3, viser.uplot.Scale(auto=True, distr=3)),
+            ("Position error, µm", distance, 1e6, viser.uplot.Scale(auto=True, distr=3)),
         ):
             if not names:
                 continue
@@ -134,7 +137,7 @@ class Panel:
                     scales=scales,
                     axes=(
                         viser.uplot.Axis(ticks=no_ticks),
-                        viser.uplot.Axis(ticks=no_ticks, size=64),
+                        viser.uplot.Axis(ticks=no_ticks, size=74),
                     ),
                     legend=viser.uplot.Legend(show=len(names) > 1, live=False),
                     aspect=1.9,

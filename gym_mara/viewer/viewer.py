@@ -74,18 +74,18 @@ class Viewer:
             gate.let_in(control, check)
         self._connect_controls()
 
-    def run(self, policy: Callable[[Floats], ArrayLike], episode_steps: int | None) -> None:
+    def run(self, policy: Callable[[Any], ArrayLike], episode_steps: int | None) -> None:
         """Play a policy, one episode after the other, until the user interrupts.
 
         Args:
-            policy: maps observations (1, O) to joint targets (1, J), rad.
+            policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad.
             episode_steps: the length of an episode; None for no end.
         """
         while True:
             observation, _ = self._simulation.reset()
             self.show()
             for _ in count() if episode_steps is None else range(episode_steps):
-                outcome = self.step(policy(observation))
+                outcome = self.step(policy(self._simulation.present(observation)))
                 observation = outcome.observation
                 if outcome.terminated.any() or outcome.truncated is not None:
                     break

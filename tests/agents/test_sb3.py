@@ -8,16 +8,29 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 from gymnasium.wrappers import NormalizeObservation, RescaleAction
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
 
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.sb3 import MaraVecEnv, in_one_batch
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
+from gym_mara.testing import pickled
+from gym_mara.types import UnitActions
 
 
 def step(env: VecEnv, action: NDArray[np.float32]) -> tuple[Any, Any, Any, list[Any]]:
@@ -186,11 +199,171 @@ def test_environments_that_do_not_form_a_batch_are_an_error(make: list[Any], mes
         in_one_batch(DummyVecEnv(make))
 
 
-def test_attributes_and_methods_reach_the_environment() -> None:
-    env = small()
-    assert env.get_attr("max_episode_steps", [0, 2]) == [4, 4]
-    assert len(env.env_method("save_state")) == 3
-    assert env.env_is_wrapped(object) == [False] * 3
-    env.seed(3)
+# The interface of VecEnv.
+
+
+def plain(num_envs: int = 3, **options: Any) -> MaraVecEnv:
+    """Arms that take joint targets, with episodes of four steps."""
+    return MaraVecEnv(
+        MaraVectorEnv(
+            num_envs, "MARAOrient-v0", autoreset_mode="SameStep", max_episode_steps=4, **options
+        )
+    )
+
+
+def test_by_default_actions_are_joint_targets() -> None:
+    env = plain()
+    assert env.action_space == env.env.single_action_space
     env.reset()
+    single = MaraEnv("MARAOrient-v0")
+    single.reset()
+    targets = np.linspace(-0.2, 0.2, 6).astype(np.float32)
+    observation, *_ = step(env, np.tile(targets, (3, 1)))
+    np.testing.assert_array_equal(observation[1], single.step(targets)[0])
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(-1.0, 1.0, (5,)),
+        Box(-np.inf, np.inf, (6,)),
+        Box(1.0, 1.0, (6,)),
+        Discrete(3),
+    ],
+)
+def test_an_action_space_that_cannot_be_scaled_is_refused(space: Any) -> None:
+    arms = MaraVectorEnv(1, autoreset_mode="SameStep")
+    with pytest.raises(GymMaraError, match=r"a bounded Box of shape \(6,\)"):
+        MaraVecEnv(arms, space)
+
+
+def test_actions_in_1_1_are_refused_in_another_scaled_space() -> None:
+    env = MaraVecEnv(MaraVectorEnv(1, autoreset_mode="SameStep"), Box(-0.5, 1.5, (6,), np.float32))
+    env.reset()
+    with pytest.raises(GymMaraError, match=r"in \[-1, 1\], and those of this environment"):
+        env.step(np.zeros((1, 6), np.float32).view(UnitActions))
+
+
+@pytest.mark.parametrize("indices", [None, [0, 1, 2], range(3), np.arange(3), (2, 1, 0)])
+def test_methods_and_attributes_of_all_arms(indices: Any) -> None:
+    env = plain()
+    assert len(env.env_method("save_state", indices=indices)) == 3
+    env.set_attr("max_episode_steps", 7, indices)
+    assert env.get_attr("max_episode_steps", indices) == [7, 7, 7]
+    assert env.env_is_wrapped(object, indices) == [False] * 3
+
+
+@pytest.mark.parametrize("indices", [0, np.int64(2), [0, 1], range(1), []])
+def test_some_arms_cannot_be_changed_alone(indices: Any) -> None:
+    env = plain()
+    with pytest.raises(GymMaraError, match=r"cannot call 'reset'.*one batch"):
+        env.env_method("reset", indices=indices)
+    with pytest.raises(GymMaraError, match=r"cannot set the attribute.*one batch"):
+        env.set_attr("max_episode_steps", 7, indices)
+    assert env.get_attr("max_episode_steps") == [4, 4, 4]
+    assert env.get_attr("max_episode_steps", indices) == [4] * np.size(indices)
+
+
+@pytest.mark.parametrize("indices", [3, -1, [0, 3], "0", 0.0, [True, False, True], [[0]]])
+def test_indices_that_are_no_arms_are_an_error(indices: Any) -> None:
+    env = plain()
+    with pytest.raises(GymMaraError, match="whole numbers from 0 to 2"):
+        env.get_attr("max_episode_steps", indices)
+    with pytest.raises(GymMaraError, match="whole numbers from 0 to 2"):
+        env.env_is_wrapped(Monitor, indices)
+
+
+def test_spaces_are_those_of_one_arm() -> None:
+    env = small()
+    assert env.get_attr("observation_space", 0) == [env.observation_space]
+    assert env.get_attr("action_space", 0) == [env.action_space]
+    assert env.has_attr("max_episode_steps")
+    assert not env.has_attr("colour")
+
+
+def test_options_of_a_reset_are_refused_as_by_a_single_environment() -> None:
+    env = small()
+    env.set_options({"colour": "red"})
+    with pytest.raises(GymMaraError, match="'colour'"):
+        env.reset()
+    env.set_options({})
+    env.reset()
+
+
+def test_each_arm_has_its_own_picture() -> None:
+    env = plain(2, render_mode="rgb_array", width=64, height=48)
+    env.reset()
+    (picture,) = env.env_method("render", indices=1)
+    assert picture.shape == (48, 64, 3)
+    tiled = env.render()
+    assert tiled is not None
+    assert tiled.size == 2 * picture.size
     env.close()
+
+
+def test_seeds_repeat_random_targets() -> None:
+    env = make_env("MARARandomTarget-v0", "pinocchio", 2, {}, max_episode_steps=4)
+    env.seed(3)
+    first = env.reset()
+    env.seed(3)
+    np.testing.assert_array_equal(env.reset(), first)
+    assert not np.array_equal(env.reset(), first)
+
+
+def test_a_copy_by_pickle_continues_alike() -> None:
+    env = small()
+    env.reset()
+    copied, action = pickled(env), np.full((3, 6), 0.1, np.float32)
+    np.testing.assert_array_equal(step(copied, action)[0], step(env, action)[0])
+
+
+# The helpers of Stable-Baselines3.
+
+
+def agent(env: VecEnv) -> PPO:
+    """A small agent."""
+    return PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+
+
+def test_evaluate_policy_gives_the_returns_of_single_environments() -> None:
+    kwargs = {"max_episode_steps": 4, "on_collision": "terminate"}
+    singles = make_vec_env("gym_mara/MARA-v0", 2, env_kwargs=kwargs, wrapper_class=rescaled)
+    batch = in_one_batch(
+        make_vec_env("gym_mara/MARA-v0", 2, env_kwargs=kwargs, wrapper_class=rescaled)
+    )
+    model = agent(singles)
+    (returns, lengths), (others, other_lengths) = (
+        evaluate_policy(model, env, 4, return_episode_rewards=True) for env in (singles, batch)
+    )
+    np.testing.assert_allclose(returns, others, rtol=1e-5)  # type: ignore[arg-type]
+    assert lengths == other_lengths
+
+
+def test_callbacks_and_wrappers_of_stable_baselines3(tmp_path: Path) -> None:
+    # A warning, such as that of a missing Monitor, is an error in these tests.
+    assert evaluate_policy(agent(small()), small(), 3)[0] != 0.0
+    env = VecNormalize(VecCheckNan(VecFrameStack(small(), 2), raise_exception=True))
+    evaluation = VecNormalize(VecCheckNan(VecFrameStack(small(2), 2)), training=False)
+    evaluating = EvalCallback(
+        evaluation, eval_freq=8, n_eval_episodes=2, log_path=str(tmp_path), verbose=0
+    )
+    saving = CheckpointCallback(8, str(tmp_path), save_vecnormalize=True)
+    model = agent(env).learn(48, callback=[evaluating, saving])
+    assert evaluating.evaluations_length == [[4, 4], [4, 4]]
+    assert len(list(tmp_path.glob("*steps.zip"))) == 2
+    assert model.ep_info_buffer
+    env.close()
+
+
+def test_vec_monitor_counts_as_the_batch_does() -> None:
+    with pytest.warns(UserWarning, match="already wrapped"):
+        monitored = VecMonitor(small())
+    monitored.reset()
+    for _ in range(4):
+        infos = step(monitored, np.zeros((3, 6), np.float32))[3]
+    own = small()
+    own.reset()
+    for _ in range(4):
+        expected = step(own, np.zeros((3, 6), np.float32))[3]
+    assert infos[0]["episode"]["l"] == expected[0]["episode"]["l"]
+    assert infos[0]["episode"]["r"] == pytest.approx(expected[0]["episode"]["r"], abs=1e-5)

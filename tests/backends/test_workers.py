@@ -385,6 +385,44 @@ def test_a_program_ends_with_its_workers_without_closing_them(tmp_path: Path) ->
     assert _all_end([int(pid) for pid in done.stdout.split()], 0.0)
 
 
+STEPPING = """
+import multiprocessing, os, sys
+import gymnasium, numpy, gym_mara
+
+if __name__ == "__main__":
+    os.dup2(os.open(sys.argv[2], os.O_CREAT | os.O_WRONLY), 2)
+    multiprocessing.set_start_method(sys.argv[1])
+    options = {"num_envs": 4, "backend": "dart", "workers": 2}
+    envs = gymnasium.make_vec("gym_mara/MARA-v0", **options)
+    envs.reset(seed=0)
+    print(*(process.pid for process in envs.simulation.backend.processes), flush=True)
+    while True:
+        envs.step(numpy.zeros((4, 6)))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("method", START_METHODS)
+def test_a_program_that_is_ended_within_a_step_prints_no_error(
+    method: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    script, errors = write(tmp_path / "script.py", STEPPING), tmp_path / "stderr"
+    with started(str(script), method, str(errors)) as process:
+        assert process.stdout is not None
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        process.send_signal(number)
+        assert process.wait(10.0) == -number
+        assert _all_end(pids, 10.0)
+    assert errors.read_text() == ""
+
+
+def test_python_without_a_main_module_has_workers(tmp_path: Path) -> None:
+    code, errors = STEPPING.replace("while True:", "for _ in range(2):"), tmp_path / "stderr"
+    command = [sys.executable, "-c", code, "spawn", str(errors)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, errors.read_text()) == (0, "")
+
+
 UNGUARDED = """
 import multiprocessing, os
 os.sched_getaffinity = lambda pid: {0, 1}
@@ -396,9 +434,12 @@ make_backend("dart", RobotModel.load("mara"), 4, {})
 """
 
 
-def test_a_program_whose_main_module_has_no_guard_ends_with_an_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", ["{}", "{'workers': 2}"])
+def test_a_program_whose_main_module_has_no_guard_ends_with_an_error(
+    tmp_path: Path, options: str
+) -> None:
     """Where processes are spawned they import the main module, and would all run the program."""
-    script = write(tmp_path / "script.py", UNGUARDED)
+    script = write(tmp_path / "script.py", UNGUARDED.replace("{})", f"{options})"))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0
     assert "put what the program does under `if __name__ == '__main__':`" in done.stderr

@@ -503,7 +503,7 @@ def test_close_closes_the_backend(
             {"ee_frame": "hand"},
             r"has no link 'hand' for the end-effector frame; it has: .*ee_link",
         ),
-        ({"robot": "none.urdf"}, r"cannot read the URDF .*none\.urdf"),
+        ({"robot": "none.urdf"}, r"cannot read .*none\.urdf"),
         ({"start_q": [0.0] * 5}, r"start_q has shape \(5,\); mara needs \(6,\)"),
         ({"start_q": [0, 3, 0, 0, 0, 0]}, r"start_q: joint motor2 cannot be at 3\.0; its limits"),
         ({"target_quaternion": [1, 1, 0, 0]}, "give a unit quaternion"),

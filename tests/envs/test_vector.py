@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -445,3 +446,13 @@ def test_a_collision_of_one_arm_does_not_affect_the_others() -> None:
     assert info["collided"].tolist() == [True, False, True]
     q = env.simulation.backend.state.q
     np.testing.assert_array_equal(q, [[0.0] * 6, [0.2] * 6, [0.0] * 6])
+
+
+@pytest.mark.parametrize("name", ["gym_mara/MARA-v0", "gym_mara/MARAGoal-v0"])
+def test_a_dropped_environment_ends_its_worker_processes(name: str) -> None:
+    envs: Any = gymnasium.make_vec(name, num_envs=2, backend="dart", workers=2)
+    envs.reset(seed=0)
+    processes = envs.simulation.backend.processes
+    del envs
+    gc.collect()
+    assert not any(process.is_alive() for process in processes)

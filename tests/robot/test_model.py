@@ -171,7 +171,7 @@ def test_reach_of_a_sliding_joint_is_its_own_travel(tmp_path: Path) -> None:
             [0, 2.36, 0, 0, 0, 0],
             r"joint motor2 cannot be at 2\.36; its limits are \[-2\.35, 2\.35\]",
         ),
-        ([0, 0, 0, 0, 0, np.nan], r"joint motor6 cannot be at nan"),
+        ([0, 0, 0, 0, 0, np.nan], r"must be a list of finite numbers"),
     ],
 )
 def test_a_configuration_is_checked(mara: RobotModel, q: list[float], message: str) -> None:
@@ -180,7 +180,7 @@ def test_a_configuration_is_checked(mara: RobotModel, q: list[float], message: s
 
 
 def test_a_missing_urdf(tmp_path: Path) -> None:
-    with pytest.raises(GymMaraError, match=r"cannot read the URDF .*none\.urdf.*No such file"):
+    with pytest.raises(GymMaraError, match=r"cannot read .*none\.urdf.*no such file"):
         RobotModel.load(tmp_path / "none.urdf", "link1")
 
 

@@ -305,7 +305,10 @@ def test_options_become_plain_values_that_json_can_store() -> None:
         ({"on_collision": "stop"}, r"unknown on_collision 'stop'.*continue, reset, terminate"),
         ({"target_position": (0.1, 0.2)}, "target_position must be a list of 3 finite numbers"),
         ({"target_position": (0.1, 0.2, np.nan)}, "target_position must be a list of 3 finite"),
-        ({"target_position": "here"}, "target_position must be a list of numbers, not 'here'"),
+        (
+            {"target_position": "here"},
+            "target_position must be a list of 3 finite numbers.*not 'here'",
+        ),
         ({"target_quaternion": (1, 0, 0)}, "target_quaternion must be a list of 4 finite numbers"),
         ({"target_quaternion": (1, 1, 0, 0)}, r"length 1\.4142; give a unit quaternion \[w, x"),
         ({"target_quaternion": (0, 0, 0, 0)}, r"length 0\.0000; give a unit quaternion"),

@@ -133,7 +133,7 @@ def test_the_user_drags_the_target(page: Page, loop: Loop) -> None:
 def test_the_panel_plots_reward_and_distance(page: Page, loop: Loop) -> None:
     page.locator(".uplot").first.wait_for()
     assert page.locator(".uplot").count() == 2
-    for label in ("Reward", "Position error, mm"):
+    for label in ("Reward", "Position error, µm"):
         assert page.get_by_text(label, exact=True).is_visible()
 
 

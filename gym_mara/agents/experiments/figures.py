@@ -20,7 +20,8 @@ from gym_mara.agents.experiments.grid import Grid, Result, read_grid, read_resul
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
 from gym_mara.files import write_text, written_aside
-from gym_mara.tasks import MAX_EPISODE_STEPS, TASKS
+from gym_mara.registration import environment, file_name
+from gym_mara.tasks import MAX_EPISODE_STEPS, named_task
 from gym_mara.types import Floats
 
 # Column of the table → where a result holds its value, and how many digits are printed.
@@ -89,9 +90,9 @@ def plot_grid(folder: Path) -> list[Path]:
         of_env = {runs[name].algo for name in results if runs[name].env == env}
         finished = [algo for algo in grid.algos if algo in of_env]
         if finished:
-            files.append(_draw(folder / f"{env}.png", grid, env, grid.algos, curves))
+            files.append(_draw(folder / f"{file_name(env)}.png", grid, env, grid.algos, curves))
         for algo in finished:
-            files.append(_draw(folder / f"{env}_{algo}.png", grid, env, [algo], curves))
+            files.append(_draw(folder / f"{file_name(env)}_{algo}.png", grid, env, [algo], curves))
     files.append(_write_curves(folder / "curves.csv", grid, curves))
     rows = list(_rows(grid, results))
     files.append(_write_table(folder / "table.csv", rows))
@@ -240,7 +241,9 @@ def _rows(grid: Grid, results: dict[str, Result]) -> Iterator[dict[str, Any]]:
             row: dict[str, Any] = {"environment": env, "algorithm": algo, "seeds": len(runs)}
             for title, (path, digits) in COLUMNS.items():
                 values = [_value(run, path) for run in runs]
-                if "angle" in title and not getattr(TASKS[env], "orientation", False):
+                if "angle" in title and not getattr(
+                    named_task(environment(env).task), "orientation", False
+                ):
                     values = [math.inf]  # the task does not judge the angle
                 row[title] = interquartile_mean(values), digits
             yield row

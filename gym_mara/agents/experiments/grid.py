@@ -38,7 +38,7 @@ from gym_mara.files import (
     write_json,
     writing,
 )
-from gym_mara.tasks import TASKS
+from gym_mara.registration import environment_names, file_name
 
 _TRAINING = "rollout/reward_per_step"
 PATIENCE = 30.0
@@ -66,8 +66,8 @@ class Grid:
     def check(self) -> None:
         """Raises GymMaraError if a name is missing, unknown or given twice, or a number is out of range."""
         for env in self.envs:
-            if env not in TASKS:
-                raise unknown("environment", env, TASKS)
+            if env not in environment_names():
+                raise unknown("environment", env, environment_names())
         for algo in self.algos:
             algorithm(algo).preset_pair(self.preset_name)
         if self.backend not in backend_names():
@@ -88,7 +88,7 @@ class Grid:
     def runs(self) -> dict[str, RunConfig]:
         """Name → run."""
         return {
-            f"{env}_{algo}_{seed}": RunConfig(
+            f"{file_name(env)}_{algo}_{seed}": RunConfig(
                 env,
                 algo,
                 self.backend,

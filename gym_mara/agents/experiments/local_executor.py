@@ -53,7 +53,7 @@ def run_in_processes(
                     process.join()
                     del running[reader]
                     if process.exitcode:
-                        failures.setdefault(name, f"its process ended with {process.exitcode}")
+                        failures.setdefault(name, _how_it_ended(process.exitcode))
                     continue
                 if kind == _FAILURE:
                     failures[name] = content
@@ -65,6 +65,17 @@ def run_in_processes(
         for _, process in running.values():
             process.join()
     return failures
+
+
+def _how_it_ended(code: int) -> str:
+    """Why a process ended that sent no reason itself."""
+    if code >= 0:
+        return f"its process ended with {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:  # a real-time signal
+        name = f"signal {-code}"
+    return f"its process was ended by {name}"
 
 
 class _Running(NamedTuple):

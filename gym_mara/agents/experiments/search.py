@@ -36,7 +36,7 @@ from gym_mara.files import (
     writing,
     written_aside,
 )
-from gym_mara.tasks import TASKS
+from gym_mara.registration import environment_names
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
@@ -61,8 +61,8 @@ class Search:
 
     def check(self) -> None:
         """Raises GymMaraError if a name is unknown or a number is out of range."""
-        if self.env not in TASKS:
-            raise unknown("environment", self.env, TASKS)
+        if self.env not in environment_names():
+            raise unknown("environment", self.env, environment_names())
         algorithm(self.algo)
         for name, most in (("steps", MOST_STEPS), ("trials", MOST_TRIALS), ("seeds", MOST_SEEDS)):
             if whole_number(name, value := getattr(self, name)) > most:
@@ -83,12 +83,14 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         GymMaraError: a value is wrong, the folder holds another search, its log is damaged, or it cannot be written.
     """
     search.check()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     start = preset_of(search.config(FIRST_SEED))
     with writing(folder):
         # Resolved because Optuna's lock is a symbolic link, and a relative path would break it.
         folder = folder.resolve()
         folder.mkdir(parents=True, exist_ok=True)
     _check_log(folder)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)  # no line for each trial
     with _replayed(folder / _LOG):
         study = optuna.create_study(
             study_name="search",
@@ -174,7 +176,6 @@ def run_search(
 
 def run_trials(search: Search, folder: Path, send: Send) -> None:
     """Run trials until the search has enough finished ones; several processes may do so."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = open_study(search, folder)
     while finished_trials(study) < search.trials:
         with writing(folder / _LOG):

@@ -124,11 +124,12 @@ def path(episodes: Episodes, target: Floats) -> go.Figure:
     points = np.vstack([target, *(episode.played.tool[:, 0] for episode in episodes)])
     middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
     half = 0.6 * max(float(np.ptp(points, axis=0).max()), 0.01)
+    axis = {"nticks": 10, "gridcolor": "#ccc"}
     axes = {
-        f"{name}axis": {"title": f"{name}, m", "range": [centre - half, centre + half], "nticks": 6}
+        f"{name}axis": {**axis, "title": f"{name}, m", "range": [centre - half, centre + half]}
         for name, centre in zip("xyz", middle, strict=True)
     }
-    camera = {"eye": {"x": -1.6, "y": -1.6, "z": 1.0}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
+    camera = {"eye": {"x": -1.4, "y": -1.4, "z": 0.9}, "center": {"x": 0.0, "y": 0.0, "z": -0.15}}
     figure.update_layout(scene={"aspectmode": "cube", **axes, "camera": camera}, height=640)
     return figure
 

@@ -8,12 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+<<<<<<< HEAD
 from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend
+=======
+from gym_mara.agents.inspection.rollout import Player, roll_out
+from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
+>>>>>>> main
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
+from gym_mara.envs.goal import GoalSettings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown, whole_number
+from gym_mara.registration import environment
 from gym_mara.tasks import named_task
 from gym_mara.types import Floats
 
@@ -83,9 +90,14 @@ def transfer(
     return rows
 
 
-def _names_of_env(task: str) -> set[str]:
+def _names_of_env(env: str) -> set[str]:
     """The keyword arguments of an environment that every backend knows, without those of pictures."""
-    forms: tuple[Any, ...] = named_task(task), SensorSettings
+    made = environment(env)
+    forms: list[Any] = [
+        named_task(made.task),
+        SensorSettings,
+        *([GoalSettings] if made.goals else []),
+    ]
     return {"robot", "ee_frame", *(field.name for form in forms for field in fields(form))}
 
 
@@ -97,8 +109,14 @@ def _play(
     episodes: int,
     which: str,
 ) -> tuple[Transferred, float | None]:
+<<<<<<< HEAD
     """How a policy does on a backend; and the player's velocity limit."""
     with Player(run, backend, {**of_env, **chosen}, which=which, episodes=episodes) as player:
+=======
+    """How a policy does on a backend; and if the joints teleport, the robot's lowest velocity limit, rad/s."""
+    options = with_options(of_env, chosen)
+    with Player(run, backend, options, which=which, episodes=episodes) as player:
+>>>>>>> main
         played = roll_out(player)
         robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
     row = Transferred(

@@ -6,13 +6,14 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, TypeGuard
+from typing import Any, ClassVar
 
 from gym_mara.agents.algorithms.base import Preset, plain_values
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, parsed_json, read_json, short
 from gym_mara.rendering import RenderSettings
+from gym_mara.robot.model import is_path
 
 MOST_STEPS = 10**12
 
@@ -131,8 +132,3 @@ def check_options(options: dict[str, Any], *, pictures: bool) -> None:
             raise GymMaraError(
                 f"{name!r} cannot be an option of a run: pictures and the viewer are set when a run is watched"
             )
-
-
-def is_path(robot: Any) -> TypeGuard[str | Path]:
-    """Whether a robot is given by the path of its file."""
-    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))

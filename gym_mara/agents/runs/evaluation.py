@@ -14,10 +14,9 @@ from gym_mara.agents.runs.policy import load_policy
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.scaling import unit_box
 from gym_mara.backends import backend_settings
-from gym_mara.envs import MaraVectorEnv
+from gym_mara.envs import MaraVectorEnv, make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.tasks import MAX_EPISODE_STEPS
 from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
@@ -27,35 +26,22 @@ MOST_EPISODES = 100_000
 
 
 def make_arms(
-    task: str,
-    backend: str,
-    num_envs: int,
-    options: dict[str, Any],
-    max_episode_steps: int | None = MAX_EPISODE_STEPS,
+    env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: int | None
 ) -> MaraVectorEnv:
-    """N arms of a task, in at most as many processes as arms."""
+    """N arms of an environment, in at most as many processes as arms; `limit` may be another `max_episode_steps`."""
     workers = options.get("workers")
     if type(workers) is int and workers > num_envs:
         options = {**options, "workers": num_envs}
-    return MaraVectorEnv(
-        num_envs,
-        task,
-        backend=backend,
-        autoreset_mode="SameStep",
-        max_episode_steps=max_episode_steps,
-        **options,
+    return make_vector_env(
+        env, num_envs, backend=backend, autoreset_mode="SameStep", **limit, **options
     )
 
 
 def make_env(
-    task: str,
-    backend: str,
-    num_envs: int,
-    options: dict[str, Any],
-    max_episode_steps: int | None = MAX_EPISODE_STEPS,
+    env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: int | None
 ) -> MaraVecEnv:
-    """N arms of a task for the agents of the presets, with actions in [-1, 1]."""
-    arms = make_arms(task, backend, num_envs, options, max_episode_steps)
+    """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
+    arms = make_arms(env, backend, num_envs, options, **limit)
     return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
 
 
@@ -115,7 +101,11 @@ def options_on(
         GymMaraError: a name cannot be an option of a run, or the robot cannot be loaded.
     """
     own = config.env_options if backend == config.backend else options_beyond_backend(config)
-    given = options or {}
+    return with_options(own, options or {})
+
+
+def with_options(own: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """The keyword arguments of a run's environment, some of them replaced as in `options_on`."""
     check_options(given, pictures=True)
     merged = {**own, **given}
     if "robot" in given or "ee_frame" in given:

@@ -69,7 +69,9 @@ class RunFolder:
                 f"{str(path)!r} exists and is not overwritten: choose another --out{hint}"
             ) from None
         except OSError as error:
-            raise GymMaraError(f"cannot make the run folder {str(path)!r}: {error}") from error
+            raise GymMaraError(
+                f"cannot make the run folder {str(path)!r}: {error.strerror}"
+            ) from error
         try:
             write_json(path / "config.json", config_values(config, versions()))
         except GymMaraError:

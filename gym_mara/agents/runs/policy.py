@@ -7,13 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.algorithms.base import Preset, policy_class
@@ -73,6 +75,8 @@ class PolicyDescription:
     """The joint targets of the action 1, rad."""
     observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=1000)]
     """The parts of the observation, in order."""
+    groups: dict[str, Annotated[int, Field(ge=1, le=10_000)]] | None
+    """The sizes of the entries of an observation that is a dictionary; None for an array."""
     normalisation: Normalisation | None
     """None for observations that are not normalised."""
     robot: str
@@ -84,6 +88,12 @@ class PolicyDescription:
             raise GymMaraError("'joints', 'low' and 'high' must have the same length")
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise GymMaraError("'low' must be below 'high'")
+        if self.groups is not None and (
+            self.normalisation or sum(self.groups.values()) != self.size
+        ):
+            raise GymMaraError(
+                "'groups' must have the size of the observation, without normalisation"
+            )
         if self.normalisation is not None:
             for values in (self.normalisation.mean, self.normalisation.var):
                 if len(values) != self.size:
@@ -122,7 +132,7 @@ class PolicyDescription:
             )
         parts = simulation.observation.parts
         layout = [ObservationPart(part.name, len(part.low)) for part in parts]
-        if layout != self.observation:
+        if layout != self.observation or _groups(simulation) != self.groups:
             theirs = ", ".join(f"{part.name} ({part.size})" for part in layout)
             raise GymMaraError(
                 f"the policy does not fit the environment: it observes {self.layout}, and the environment "
@@ -165,7 +175,16 @@ class Policy:
         Raises:
             GymMaraError: the observation has another shape or is not finite.
         """
-        observed = self._checked(observation)
+        groups = self.about.groups
+        observed: Any
+        if groups is None:
+            observed = self._checked(observation, self.about.size)
+        elif isinstance(observation, dict) and observation.keys() == groups.keys():
+            observed = {name: self._checked(observation[name], groups[name]) for name in groups}
+        else:
+            raise GymMaraError(
+                f"the policy needs an observation that is a dictionary of {', '.join(groups)}"
+            )
         if self._normalised:
             scaled = (observed - self._mean) / self._deviation
             observed = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
@@ -177,12 +196,11 @@ class Policy:
             raise DamagedRunError("the policy's action is not finite: its weights are damaged")
         return self._scaling.targets(actions), None
 
-    def _checked(self, observation: Any) -> Floats:
+    def _checked(self, observation: Any, size: int) -> Floats:
         try:
             observed = np.asarray(observation, np.float64)
         except (TypeError, ValueError) as error:
             raise GymMaraError(f"an observation must be an array of numbers: {error}") from error
-        size = self.about.size
         if observed.ndim not in (1, 2) or observed.shape[-1] != size or not observed.size:
             raise GymMaraError(
                 f"the policy needs observations of shape ({size},) or (N, {size}), not {observed.shape}: "
@@ -223,7 +241,9 @@ def read_policy(folder: Path, preset: Preset) -> Policy:
         DamagedRunError: a file is missing or damaged, or does not fit the preset.
     """
     about = read_description(folder)
-    space = Box(-np.inf, np.inf, (about.size,), np.float64)
+    space: Space[Any] = _box(about.size)
+    if about.groups is not None:
+        space = Dict({name: _box(size) for name, size in about.groups.items()})
     try:
         weights = read_weights(folder / "model.zip")
         network = make_network(preset, space, unit_box(len(about.joints)))
@@ -251,14 +271,18 @@ def read_description(folder: Path) -> PolicyDescription:
         raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
 
 
-def make_network(preset: Preset, observation: Box, actions: Box) -> ActorCriticPolicy:
+def _box(size: int) -> Box:
+    return Box(-np.inf, np.inf, (size,), np.float64)
+
+
+def make_network(preset: Preset, observation: Space[Any], actions: Box) -> ActorCriticPolicy:
     """The untrained policy network of a preset."""
     make = policy_class(preset.policy)
-    return make(observation, actions, lambda _: 0.0, **policy_arguments(preset))
+    return make(observation, actions, lambda _: 0.0, **policy_arguments(preset, observation))
 
 
-def policy_arguments(preset: Preset) -> dict[str, Any]:
-    """The keyword arguments of a preset's policy network.
+def policy_arguments(preset: Preset, observation: Space[Any]) -> dict[str, Any]:
+    """The keyword arguments of a preset's policy network, for the observations of this space.
 
     Raises:
         GymMaraError: torch has no such optimiser.
@@ -269,6 +293,8 @@ def policy_arguments(preset: Preset) -> dict[str, Any]:
         if not (isinstance(optimizer, type) and issubclass(optimizer, torch.optim.Optimizer)):
             raise GymMaraError(f"torch.optim has no optimiser {name!r}")
         arguments["optimizer_class"] = optimizer
+    if isinstance(observation, Dict):
+        arguments["features_extractor_class"] = CombinedExtractor
     return arguments
 
 
@@ -307,10 +333,19 @@ def _description(model: OnPolicyAlgorithm) -> PolicyDescription:
         low=simulation.action_space.low.tolist(),
         high=simulation.action_space.high.tolist(),
         observation=[ObservationPart(p.name, len(p.low)) for p in simulation.observation.parts],
+        groups=_groups(simulation),
         normalisation=statistics,
         robot=fingerprint(simulation.robot),
         versions=versions(),
     )
+
+
+def _groups(simulation: Simulation) -> dict[str, int] | None:
+    """The sizes of the entries of an observation that is a dictionary."""
+    space = simulation.observation_space
+    if not isinstance(space, Dict):
+        return None
+    return {name: gymnasium.spaces.flatdim(entry) for name, entry in space.items()}
 
 
 def normalisation(model: Any) -> VecNormalize:

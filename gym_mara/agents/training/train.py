@@ -5,15 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
@@ -25,13 +24,19 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
-from gym_mara.agents.algorithms.registry import algorithm
+from gym_mara.agents.algorithms.registry import (
+    DEFAULT_ALGORITHM,
+    DEFAULT_PRESET,
+    algorithm,
+)
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import RunConfig, RunFolder, read_progress
 from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
+from gym_mara.files import locked
 
 
 def train(
@@ -99,24 +104,10 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
     return _learn(run, model, on_progress, reached)
 
 
-@contextmanager
-def _locked(run: RunFolder) -> Iterator[None]:
-    """Lock a run for this process; the operating system releases the lock if the process is killed.
-
-    Raises:
-        GymMaraError: another process trains it.
-    """
-    lock = FileLock(run.path / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise GymMaraError(f"another process is training {str(run.path)!r}; wait for it") from None
-    except OSError as error:
-        raise GymMaraError(f"cannot write to {str(run.path)!r}: {error.strerror}") from error
-    try:
-        yield
-    finally:
-        lock.release()
+def _locked(run: RunFolder) -> AbstractContextManager[None]:
+    """Lock a run for this process."""
+    busy = f"another process is training {str(run.path)!r}; wait for it"
+    return locked(run.path / ".lock", busy)
 
 
 def new_model(config: RunConfig) -> OnPolicyAlgorithm:
@@ -130,6 +121,43 @@ def new_model(config: RunConfig) -> OnPolicyAlgorithm:
         raise
 
 
+def preset_agent(
+    task: str = "MARA-v0",
+    algo: str = DEFAULT_ALGORITHM,
+    *,
+    preset: str = DEFAULT_PRESET,
+    backend: str = DEFAULT_BACKEND,
+    seed: int = 0,
+    **options: Any,
+) -> OnPolicyAlgorithm:
+    """An untrained agent with the hyperparameters of a preset and its environment, for a script of your own.
+
+    Args:
+        task: the name of a task.
+        algo: the name of an algorithm.
+        preset: the name of a preset.
+        backend: the name of a backend.
+        seed: of the policy, the sampling and the environment.
+        **options: keyword arguments of the environment.
+
+    Returns:
+        A model of Stable-Baselines3, such as PPO. Schedules of the preset end with the steps given to its first `learn`.
+
+    Raises:
+        GymMaraError: a name is unknown, or a value is out of its range.
+    """
+    config = RunConfig(
+        env=task,
+        algo=algo,
+        backend=backend,
+        steps=1,  # not used: the caller calls `learn`
+        seed=seed,
+        env_options=options,
+        preset_name=preset,
+    )
+    return new_model(replace(config, preset=asdict(preset_of(config))))
+
+
 def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
     """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3.
 
@@ -141,7 +169,7 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
-    arguments["policy_kwargs"] = policy_arguments(preset)
+    arguments["policy_kwargs"] = policy_arguments(preset, env.observation_space)
     policy = policy_class(preset.policy)
     make = algorithm(algo).load_class()
     try:
@@ -245,9 +273,13 @@ def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
         os.replace(run.progress_file, kept)
     rows = read_progress(kept) if kept.is_file() else []
     table = CSVOutputFormat(str(run.progress_file))
-    for row in rows:
-        if row["time/total_timesteps"] <= steps:
-            table.write(dict(row), {})
+    try:
+        for row in rows:
+            if row["time/total_timesteps"] <= steps:
+                table.write(dict(row), {})
+    except BaseException:
+        table.close()
+        raise
     kept.unlink(missing_ok=True)
     folder = str(run.path / "tensorboard")
     if steps == 0:

@@ -11,7 +11,7 @@ import pinocchio as pin
 from gym_mara.backends.servo import has_diverged
 from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
@@ -254,8 +254,7 @@ class DartArm:
 
 def _world(physics_step: float, detector: str) -> Any:
     """An empty world with gravity."""
-    if detector not in DETECTORS:
-        raise unknown("detector", detector, DETECTORS)
+    one_of("detector", detector, DETECTORS)
     world = dart.simulation.World()
     world.setTimeStep(physics_step)
     world.setGravity([0.0, 0.0, -GRAVITY])

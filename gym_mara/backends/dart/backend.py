@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.backends.dart.arm import DartArm
+from gym_mara.backends.dart.arm import DETECTORS, DartArm
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import Motion, ServoBackend, servo_motion
+from gym_mara.errors import GymMaraError, one_of
 from gym_mara.robot import RobotModel
 from gym_mara.state import Contact, SimState
 from gym_mara.types import Floats, Mask
 
+MOST_LATE_PERIODS = 1000
+"""The longest latency, control periods."""
 # The parameters that the engine needs to know; the servos and the sensors take care of the others.
 _OF_ENGINE = ("mass", "effort_limit", "joint_friction", "contact_friction")
 
@@ -40,6 +43,7 @@ class DartBackend(ServoBackend):
     """
 
     in_processes = True  # DART holds Python's lock while it steps
+    most_arms = 2**14  # each has a world of about 0.7 MB
 
     def __init__(
         self,
@@ -64,8 +68,8 @@ class DartBackend(ServoBackend):
             on_divergence=on_divergence,
         )
         self._settings |= {"detector": detector, "randomisation": randomisation}
-        self.detector = detector
-        self.randomisation = Randomisation(randomisation or {}, robot)
+        self.detector = one_of("detector", detector, DETECTORS)
+        self.randomisation = Randomisation({} if randomisation is None else randomisation, robot)
         self.random = bool(self.randomisation.ranges)
         self._parameters = {
             name: np.repeat(value[None], num_envs, axis=0)
@@ -76,6 +80,12 @@ class DartBackend(ServoBackend):
             self.arms.append(self._new_arm())
         # The latest targets (N, D, J), the newest last: as many as the longest latency needs.
         longest = self.randomisation.ranges.get("latency", (0.0, 0.0))[1]
+        periods = longest / self.control_period
+        if periods > MOST_LATE_PERIODS:
+            raise GymMaraError(
+                f"the latency must be at most {MOST_LATE_PERIODS} control periods of {self.control_period:g} s, because "
+                f"the targets of that time are kept; not {longest:g} s"
+            )
         self._targets = np.stack([self._q] * (int(longest // self.control_period) + 2), axis=1)
         self._latency = np.zeros((num_envs, 1))
         self.reset(np.tile(robot.home, (num_envs, 1)))

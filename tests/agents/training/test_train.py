@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
+import contextlib
+import errno
 import json
+import os
 import pickle
 import shutil
 import time
@@ -17,17 +20,18 @@ import pytest
 import torch
 from filelock import FileLock
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import CSVOutputFormat
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gym_mara.agents.algorithms.base import Preset
 from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.archive import read_weights
-from gym_mara.agents.runs.evaluation import METRICS, evaluate_run, spread
+from gym_mara.agents.runs.evaluation import METRICS, evaluate_run, make_env, spread
 from gym_mara.agents.runs.folder import DamagedRunError, RunFolder, read_progress
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.training import callbacks
 from gym_mara.agents.training import train as train_module
-from gym_mara.agents.training.train import resume, train
+from gym_mara.agents.training.train import preset_agent, preset_of, resume, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import ROLLOUT, config, silent
 from tests.helpers import started
@@ -216,12 +220,6 @@ def test_an_evaluation_uses_the_environment_of_the_training(
     )
 
 
-@pytest.mark.parametrize("episodes", [0, -1])
-def test_an_evaluation_needs_an_episode(finished_run: RunFolder, episodes: int) -> None:
-    with pytest.raises(GymMaraError, match="episodes must be at least 1"):
-        evaluate_run(finished_run, episodes=episodes)
-
-
 def copy_of(run: RunFolder, path: Path) -> RunFolder:
     """A copy of a run, which a test may damage."""
     shutil.copytree(run.path, path)
@@ -308,30 +306,6 @@ def test_a_policy_of_another_environment_is_refused(
     file.write_text(file.read_text().replace("MARACollisionOrient-v0", "MARA-v0"))
     with pytest.raises(GymMaraError, match="does not fit the environment"):
         evaluate_run(RunFolder.open(run.path))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"steps": "many"},
-        {"seed": 1.5},
-        {"checkpoint_every": True},
-        {"env": None},
-        {"env_options": []},
-        {"preset": {}},
-        {"preset": []},
-        {"preset": {"num_envs": 1, "colour": "red"}},
-        {"preset": {"num_envs": "many"}},
-        {"preset": {"num_envs": 1, "policy": "mpl"}},
-    ],
-)
-def test_a_configuration_with_wrong_types_is_an_error(
-    finished_run: RunFolder, tmp_path: Path, change: dict[str, Any]
-) -> None:
-    values = json.loads((finished_run.path / "config.json").read_text())
-    (tmp_path / "config.json").write_text(json.dumps(values | change))
-    with pytest.raises(DamagedRunError, match="damaged"):
-        RunFolder.open(tmp_path)
 
 
 def test_a_preset_with_an_unknown_policy_is_refused() -> None:
@@ -443,20 +417,84 @@ def test_a_failed_training_closes_its_environments(
     assert {id(env) for env in opened} == {id(env) for env in closed}
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", '{"env": "MARA-v0", "versions": {}}'])
-def test_a_damaged_configuration_is_an_error(tmp_path: Path, text: str) -> None:
-    (tmp_path / "config.json").write_text(text)
-    with pytest.raises(GymMaraError, match="damaged"):
-        RunFolder.open(tmp_path)
-
-
-def test_a_folder_without_a_run_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(GymMaraError, match="not a run folder"):
-        RunFolder.open(tmp_path)
-
-
 def test_an_unfinished_run_has_no_last_policy(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     run = RunFolder(tmp_path / "run", config())
     with pytest.raises(GymMaraError, match="has no 'last' policy"):
         evaluate_run(run)
+
+
+def test_a_full_disk_ends_a_training_with_one_line_and_the_run_can_be_resumed(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    kept = run.checkpoints()
+
+    def full(self: object, values: object, *arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CSVOutputFormat, "write", full)
+        with pytest.raises(GymMaraError, match=r"cannot write to .*No space left.*--resume"):
+            resume(run.path, silent)
+    with monkeypatch.context() as patch:
+        patch.setattr(PPO, "save", full)
+        with pytest.raises(GymMaraError, match=r"cannot write .*No space left"):
+            resume(run.path, silent)
+    assert run.checkpoints() == kept
+    assert not list(run.path.glob("checkpoints/.*"))
+    assert_same_training(finished_run, resume(run.path, silent))
+
+
+def test_a_run_in_a_read_only_folder_is_not_resumed(
+    finished_run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(FileLock, "_acquire", refuse)
+    with pytest.raises(GymMaraError, match=r"cannot write to .*Read-only"):
+        resume(finished_run.path, silent)
+
+
+def test_another_failure_of_the_system_is_not_taken_for_a_full_disk(tmp_path: Path) -> None:
+    def fail(steps: int, shown: dict[str, float]) -> None:
+        raise BrokenPipeError(errno.EPIPE, "a worker died")
+
+    with pytest.raises(BrokenPipeError):
+        train(config(), tmp_path / "run", fail)
+
+
+def test_a_table_that_is_no_plain_file_is_not_written(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    run = copy_of(finished_run, tmp_path / "run")
+    shutil.rmtree(run.path / "last")
+    shutil.rmtree(run.checkpoints()[-1])
+    run.progress_file.unlink()
+    os.mkfifo(run.progress_file)
+    with pytest.raises(GymMaraError, match=r"progress.csv.*not a plain file"):
+        resume(run.path, silent)
+
+
+def test_evaluations_have_at_most_as_many_workers_as_arms() -> None:
+    asked = config(env="MARA-v0", backend="dart", env_options={"workers": 2})
+    assert preset_of(asked).num_envs == 16
+    with contextlib.closing(make_env("MARA-v0", "dart", 1, asked.env_options)) as env:
+        assert env.num_envs == 1
+    with pytest.raises(GymMaraError, match="workers"):
+        make_env("MARA-v0", "dart", 1, {"workers": "two"})
+
+
+def test_an_agent_of_a_preset_for_a_script_trains_as_a_run(
+    finished_run: RunFolder,
+) -> None:
+    asked = finished_run.config
+    model = preset_agent(asked.env, asked.algo, seed=asked.seed)
+    model.learn(asked.steps)
+    mine, theirs = model.policy.state_dict(), parameters(finished_run)
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+    with pytest.raises(GymMaraError, match="unknown keyword argument 'colour'"):
+        preset_agent(colour="red")

@@ -1,0 +1,107 @@
+"""The environments by name: the tasks, and the goal environment. Each is registered with Gymnasium."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from gymnasium.envs.registration import register
+
+from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.tasks.base import Task
+from gym_mara.tasks.registry import MAX_EPISODE_STEPS, TASKS, named_task, task_names
+
+_NAMESPACE = "gym_mara"
+
+
+class Environment(NamedTuple):
+    """How an environment is made."""
+
+    task: str
+    """The name of its task."""
+    max_episode_steps: int = MAX_EPISODE_STEPS
+    """The length of its episodes, steps."""
+    goals: bool = False
+    """Whether it is a goal environment: its classes are MaraGoalEnv and MaraGoalVectorEnv, else MaraEnv and MaraVectorEnv."""
+
+
+ENVIRONMENTS: dict[str, Environment] = {}
+"""The environments that are registered with Gymnasium in this process, by name."""
+
+
+def register_task(
+    name: str, task: Task | None = None, *, max_episode_steps: int = MAX_EPISODE_STEPS
+) -> None:
+    """Register a task as an environment of Gymnasium, single and vectorised.
+
+    Args:
+        name: the name of the task and the id of the environment, such as "my_package/MARATouch-v0".
+        task: the task; None for the task of an entry point `gym_mara.tasks` with this name.
+        max_episode_steps: the number of steps after which an episode is truncated.
+
+    Raises:
+        GymMaraError: `task` is no Task, or another task has this name.
+    """
+    if task is not None and not isinstance(task, Task):
+        raise GymMaraError(f"task must be a Task, such as TouchTask(), not {task!r}")
+    if task is not None and TASKS.setdefault(name, task) != task:
+        raise GymMaraError(f"another task has the name {name!r}: choose another name")
+    steps = whole_number("max_episode_steps", max_episode_steps)
+    _register(name, Environment(name, steps), {"task": name})
+
+
+def _register(name: str, environment: Environment, keywords: dict[str, str]) -> None:
+    kind = "Goal" if environment.goals else ""
+    register(
+        id=environment_id(name),
+        entry_point=f"gym_mara.envs:Mara{kind}Env",
+        vector_entry_point=f"gym_mara.envs:Mara{kind}VectorEnv",
+        kwargs=keywords,
+        max_episode_steps=environment.max_episode_steps,
+    )
+    ENVIRONMENTS[name] = environment
+
+
+def register_environments() -> None:
+    """Register the environments of this package."""
+    for name in TASKS:
+        register_task(name)
+    _register("MARAGoal-v0", Environment("MARARandomTarget-v0", 50, goals=True), {})
+
+
+def environment_id(name: str) -> str:
+    """The id with Gymnasium: a name without a namespace is of this package."""
+    return name if "/" in name else f"{_NAMESPACE}/{name}"
+
+
+def file_name(name: str) -> str:
+    """The name of an environment for files and folders: a namespace is separated by a hyphen."""
+    return name.replace("/", "-")
+
+
+def environment_names() -> list[str]:
+    """The names that `environment` knows. No other package is imported."""
+    return [*ENVIRONMENTS, *(name for name in task_names() if name not in ENVIRONMENTS)]
+
+
+def environment(name: str) -> Environment:
+    """The environment with this name, which may have the form of an id: "gym_mara/MARA-v0", "gym_mara:gym_mara/MARA-v0".
+
+    Raises:
+        GymMaraError: the name is unknown, or the task of another package cannot be loaded.
+    """
+    own = environment_name(name)
+    if own not in ENVIRONMENTS:
+        named_task(own)  # imports the other package, which may register it
+    return ENVIRONMENTS.get(own) or Environment(own)
+
+
+def environment_name(name: str) -> str:
+    """The name of an environment, given with or without the module and the namespace of its id.
+
+    Raises:
+        GymMaraError: the name is unknown.
+    """
+    own = str(name).rpartition(":")[2].removeprefix(f"{_NAMESPACE}/")
+    if own not in ENVIRONMENTS and own not in (names := environment_names()):
+        raise unknown("environment", name, names)
+    return own

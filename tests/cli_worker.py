@@ -1,0 +1,145 @@
+"""A process that runs the command gym-mara many times, for tests/test_cli_fuzz.py."""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import psutil
+
+LIMIT = 60.0
+"""How long a call may take, s; alone on a machine the slowest takes a few seconds."""
+_EPISODE_STEPS = 32
+"""The episodes are short, so that a call takes little time where nothing is wrong with it."""
+_START = 120.0
+"""How long a worker may take for its imports, s."""
+_SPAWN = multiprocessing.get_context("spawn")
+_HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+
+
+class Ended(NamedTuple):
+    """How a call has ended."""
+
+    code: object
+    """Its exit code; None if it took too long or its process died."""
+    output: str
+    """Its stdout and its stderr."""
+    children: list[str]
+    """The processes that it left behind."""
+
+
+class Worker:
+    """Runs calls one after the other in a process of its own, which it replaces after a call that hangs."""
+
+    def __init__(self) -> None:
+        self._start()
+
+    def _start(self) -> None:
+        self._pipe, its_end = _SPAWN.Pipe()
+        self._process = _SPAWN.Process(target=_work, args=(its_end,))
+        self._process.start()
+        its_end.close()
+        assert self._pipe.poll(_START)
+        self._pipe.recv()
+
+    def call(self, arguments: list[str], folder: Path) -> Ended:
+        """Run a command in a folder."""
+        self._pipe.send((arguments, folder))
+        with suppress(EOFError):
+            if self._pipe.poll(LIMIT):
+                return Ended(*self._pipe.recv())
+        trace = self.close()
+        self._start()
+        return Ended(None, trace, [])
+
+    def close(self) -> str:
+        """Kill the process and all that it started; returns why it may have died."""
+        died = self._process.exitcode
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid or 0, signal.SIGKILL)
+        self._process.join()
+        self._pipe.close()
+        return f"no end after {LIMIT:g} s" if died is None else f"its process ended with {died}"
+
+
+def _work(pipe: Connection) -> None:
+    os.setsid()
+    _prepare()
+    pipe.send(None)
+    with suppress(EOFError):
+        while True:
+            pipe.send(_run(*pipe.recv()))
+
+
+def _prepare() -> None:
+    """Import what the commands import, and replace what would start processes or wait for a user."""
+    from gym_mara import tasks
+
+    tasks.MAX_EPISODE_STEPS = _EPISODE_STEPS  # before another module imports it
+
+    from gym_mara import cli  # noqa: F401
+    from gym_mara.agents.experiments import figures, local_executor, search  # noqa: F401
+    from gym_mara.agents.experiments.executor import Job, OnMessage, failure_of
+    from gym_mara.agents.inspection import report
+    from gym_mara.agents.training.train import use_one_thread
+    from gym_mara.viewer.viewer import Viewer
+
+    def run_here(jobs: Mapping[str, Job], on_message: OnMessage, processes: int) -> dict[str, str]:
+        ended = {name: failure_of(job, partial(on_message, name)) for name, job in jobs.items()}
+        return {name: reason for name, reason in ended.items() if reason is not None}
+
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    vars(local_executor)["run_in_processes"] = vars(search)["run_in_processes"] = run_here
+    vars(report)["_VIDEO_SECONDS"] = 0.1
+    setattr(Viewer, "run", interrupted)  # noqa: B010
+    use_one_thread()
+
+
+def _run(arguments: list[str], folder: Path) -> tuple[object, str, list[str]]:
+    from gym_mara.cli import main
+
+    os.chdir(folder)
+    written = io.BytesIO()
+    sys.stdout = sys.stderr = io.TextIOWrapper(written, "utf-8", write_through=True)
+    sys.argv = ["gym-mara", *arguments]
+    code: object = "no SystemExit"
+    try:
+        main()
+    except SystemExit as exit_:
+        code = exit_.code
+    except BaseException as error:
+        code = repr(error)
+    output = written.getvalue().decode()
+    return code, output, _children()
+
+
+def _children() -> list[str]:
+    """The commands of the processes that are left after a moment; they are killed."""
+    deadline = time.monotonic() + 5.0
+    while (left := _living()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    for child in left.values():
+        child.kill()
+    return list(left)
+
+
+def _living() -> dict[str, psutil.Process]:
+    found = {}
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            command = " ".join(child.cmdline())
+            if command and not any(helper in command for helper in _HELPERS):
+                found[command] = child
+    return found
