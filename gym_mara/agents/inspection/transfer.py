@@ -8,13 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-<<<<<<< HEAD
 from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
-from gym_mara.agents.runs.evaluation import options_beyond_backend
-=======
-from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
->>>>>>> main
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.envs.goal import GoalSettings
@@ -109,14 +104,9 @@ def _play(
     episodes: int,
     which: str,
 ) -> tuple[Transferred, float | None]:
-<<<<<<< HEAD
     """How a policy does on a backend; and the player's velocity limit."""
-    with Player(run, backend, {**of_env, **chosen}, which=which, episodes=episodes) as player:
-=======
-    """How a policy does on a backend; and if the joints teleport, the robot's lowest velocity limit, rad/s."""
     options = with_options(of_env, chosen)
     with Player(run, backend, options, which=which, episodes=episodes) as player:
->>>>>>> main
         played = roll_out(player)
         robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
     row = Transferred(
