@@ -17,7 +17,7 @@ from rich.console import Console
 from gym_mara import cli
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.agents.experiments.grid import Grid
-from gym_mara.cli import experiments
+from gym_mara.cli import common, experiments
 from gym_mara.cli.app import app
 from gym_mara.cli.common import whole
 from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
@@ -48,7 +48,9 @@ class Cli:
 @pytest.fixture
 def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
     """The command."""
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "200")  # for the help
+    for console in (common.out, common.err):
+        monkeypatch.setattr(console, "width", 200)
     return Cli(monkeypatch, capsys)
 
 

@@ -26,7 +26,6 @@ from gym_mara.files import (
     written_aside,
 )
 
-
 ROOT = Path(__file__).resolve().parents[1]
 
 
