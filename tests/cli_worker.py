@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-LIMIT = 60.0
+LIMIT = 20.0
 """How long a call may take, s; alone on a machine the slowest takes a few seconds."""
 _EPISODE_STEPS = 32
 """The episodes are short, so that a call takes little time where nothing is wrong with it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -11,12 +12,16 @@ from typing import Any
 
 import pytest
 import typer
+from rich.console import Console
 
 from gym_mara import cli
 from gym_mara.agents.algorithms.registry import ALGORITHMS
+from gym_mara.agents.experiments.grid import Grid
+from gym_mara.cli import experiments
 from gym_mara.cli.app import app
 from gym_mara.cli.common import whole
-from gym_mara.tasks import TASKS
+from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
+from gym_mara.tasks import ReachTask, registry
 
 
 def _commands() -> dict[str, Any]:
@@ -50,7 +55,7 @@ def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 def test_list_shows_everything(gym_mara: Cli) -> None:
     code, out, _ = gym_mara("list")
     assert code == 0
-    assert all(f"gym_mara/{task}" in out for task in TASKS)
+    assert all(environment_id(name) in out for name in environment_names())
     assert "pinocchio" in out
     assert "ur5" in out
     words = out.split()  # a narrow terminal wraps the lines
@@ -110,6 +115,57 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     code, _, err = gym_mara("train", "--out", run)
     assert code == 2
     assert "not overwritten" in err
+
+
+def test_the_steps_that_were_trained_are_printed_if_they_are_more(
+    gym_mara: Cli, tmp_path: Path
+) -> None:
+    more = "Trained 512 steps: an update needs a whole rollout"
+    train = ("train", "--env", "MARAGoal-v0")  # its episodes are short
+    assert more in gym_mara(*train, "--steps", "300", "--out", tmp_path / "more")[1]
+    assert "Trained" not in gym_mara(*train, "--steps", "512", "--out", tmp_path / "exact")[1]
+
+
+def test_an_interrupt_before_there_is_a_run_says_that_nothing_is_saved(
+    gym_mara: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gym_mara.agents.training.train.train", interrupted)
+    code, _, err = gym_mara("train", "--out", tmp_path / "run")
+    assert (code, err) == (130, "Interrupted. Nothing was saved.\n")
+
+
+def test_a_task_of_another_package_is_trained_under_its_name(
+    gym_mara: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "another_package/MARASteep-v0"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(registry.TASKS, name, ReachTask(alpha=9.0))
+    monkeypatch.setitem(ENVIRONMENTS, name, Environment(name, 32))
+    asked = ("--env", name, "--algo", "ppo", "--steps", "512")
+    assert gym_mara("train", *asked)[0] == 0
+    [run] = Path("runs").iterdir()
+    assert "another_package-MARASteep-v0" in run.name
+    assert (run / "last/model.zip").is_file()
+    assert name in gym_mara("evaluate", run)[1]
+    assert gym_mara("rewards", "--env", name, "--record", "x.csv", "--states", "4")[0] == 0
+    assert gym_mara("rewards", "--check", "x.csv")[0] == 0
+    grid = Grid((name, "MARAGoal-v0"), ("ppo",), 1, 512)
+    assert list(grid.runs()) == [
+        "another_package-MARASteep-v0_ppo_0",
+        "MARAGoal-v0_ppo_0",
+    ]
+
+
+def test_the_table_of_a_grid_ends_with_its_results(tmp_path: Path) -> None:
+    view = experiments._GridView(tmp_path, Grid(("MARA-v0",), ("ppo",), 1, 512))
+    view.on_message("MARA-v0_ppo_0", (512, {"eval_position_error_mm": 1.25}))
+    console = Console(file=io.StringIO())
+    with console.capture() as captured:
+        console.print(view.table())
+    assert "100%    1.25 mm" in captured.get()
 
 
 def test_rewards_are_recorded_and_checked(gym_mara: Cli, tmp_path: Path) -> None:

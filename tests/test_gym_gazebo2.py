@@ -52,7 +52,7 @@ def test_an_episode_equals_one_of_the_registered_environment(name: str) -> None:
 
 @pytest.mark.parametrize("size", [3, None])
 def test_set_episode_size_sets_the_length_of_episodes(size: int | None) -> None:
-    env = GazeboMaraEnv()
+    env: Any = gymnasium.make("MARA-v0")
     if size is not None:
         env.set_episode_size(size)
     for _ in range(2):

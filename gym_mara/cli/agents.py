@@ -117,6 +117,8 @@ def train(
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress)
     _print_evaluation(run, episodes=1)
+    if (trained := run.trained_steps()) > run.config.steps:
+        out.print(f"Trained {trained:,} steps: an update needs a whole rollout of all arms.")
     out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 

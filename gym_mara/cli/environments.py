@@ -74,7 +74,7 @@ def rewards(
     states: Annotated[
         int,
         typer.Option(
-            parser=whole(1, regression.MOST_STATES), metavar="N", help="How many states to record."
+            parser=whole(2, regression.MOST_STATES), metavar="N", help="How many states to record."
         ),
     ] = 256,
     tolerance: Annotated[

@@ -128,4 +128,6 @@ for _name in PAPER_TASKS:
         id=_name,
         entry_point="gym_mara.compat.gym_gazebo2:GazeboMaraEnv",
         kwargs={"task": _name},
+        order_enforce=False,  # Gymnasium's wrappers would hide `set_episode_size`
+        disable_env_checker=True,
     )

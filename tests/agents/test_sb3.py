@@ -110,6 +110,14 @@ def test_any_algorithm_of_stable_baselines3_trains_on_it() -> None:
     assert model.ep_info_buffer[0]["l"] == 4
 
 
+def test_it_takes_what_make_vec_makes() -> None:
+    made = gymnasium.make_vec("gym_mara/MARA-v0", num_envs=2, autoreset_mode="SameStep")
+    with pytest.raises(ValueError, match="expect OpenAI Gym to be installed"):
+        PPO("MlpPolicy", made, device="cpu")  # type: ignore[arg-type]
+    assert isinstance(made, MaraVectorEnv)
+    PPO("MlpPolicy", MaraVecEnv(made), n_steps=8, batch_size=16, device="cpu").learn(16)
+
+
 def test_another_autoreset_mode_is_refused() -> None:
     with pytest.raises(GymMaraError, match="SameStep"):
         MaraVecEnv(MaraVectorEnv(2))

@@ -24,7 +24,6 @@ from pathlib import Path
 from gym_mara.agents.runs.config import DamagedRunError, RunConfig, config_values, read_config
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.files import DamagedFileError, read_text, write_json
-from gym_mara.files import write_text as write_atomically
 
 __all__ = [
     "POLICIES",
@@ -33,7 +32,6 @@ __all__ = [
     "RunFolder",
     "read_progress",
     "versions",
-    "write_atomically",
 ]
 
 POLICIES = ("last", "best")

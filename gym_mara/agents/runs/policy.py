@@ -1,18 +1,16 @@
-"""A policy on disk: a folder with the model, and with a description of how it is used."""
+"""A trained policy: how it acts, and its folder with the model and policy.json."""
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
@@ -21,123 +19,19 @@ from stable_baselines3.common.vec_env import VecNormalize
 from gym_mara.agents.algorithms.base import Preset, policy_class
 from gym_mara.agents.runs.archive import read_weights
 from gym_mara.agents.runs.config import DamagedRunError
-from gym_mara.agents.runs.folder import RunFolder, versions
+from gym_mara.agents.runs.description import (
+    Normalisation,
+    PolicyDescription,
+    described,
+    read_description,
+)
+from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.scaling import Scaling, unit_box
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
-from gym_mara.files import DamagedFileError, read_json, replace_folder, write_json, writing
-from gym_mara.robot.fingerprint import fingerprint
+from gym_mara.files import DamagedFileError, replace_folder, write_json, writing
 from gym_mara.types import Floats
-
-_FORBID: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
-_Numbers = Annotated[list[float], Field(min_length=1, max_length=10_000)]
-
-
-@dataclass(frozen=True)
-class ObservationPart:
-    """A named part of the observation."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
-
-    name: str
-    size: Annotated[int, Field(ge=1, le=10_000)]
-
-
-@dataclass(frozen=True)
-class Normalisation:
-    """How observations are normalised: (o - mean) / √(var + epsilon), clipped to ±clip."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
-
-    mean: _Numbers
-    var: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=1, max_length=10_000)]
-    epsilon: Annotated[float, Field(gt=0.0)]
-    clip: Annotated[float, Field(gt=0.0)]
-
-
-@dataclass(frozen=True)
-class PolicyDescription:
-    """The content of policy.json: what a policy observes, and what its actions mean.
-
-    Raises:
-        GymMaraError: lengths differ, or a range is empty.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
-
-    format: Literal[1]
-    joints: Annotated[list[str], Field(min_length=1, max_length=1000)]
-    """The names of the joints, in the order of the actions."""
-    low: _Numbers
-    """The joint targets of the action -1, rad."""
-    high: _Numbers
-    """The joint targets of the action 1, rad."""
-    observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=1000)]
-    """The parts of the observation, in order."""
-    groups: dict[str, Annotated[int, Field(ge=1, le=10_000)]] | None
-    """The sizes of the entries of an observation that is a dictionary; None for an array."""
-    normalisation: Normalisation | None
-    """None for observations that are not normalised."""
-    robot: str
-    """The fingerprint of the robot."""
-    versions: dict[str, str]
-
-    def __post_init__(self) -> None:
-        if not len(self.joints) == len(self.low) == len(self.high):
-            raise GymMaraError("'joints', 'low' and 'high' must have the same length")
-        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise GymMaraError("'low' must be below 'high'")
-        if self.groups is not None and (
-            self.normalisation or sum(self.groups.values()) != self.size
-        ):
-            raise GymMaraError(
-                "'groups' must have the size of the observation, without normalisation"
-            )
-        if self.normalisation is not None:
-            for values in (self.normalisation.mean, self.normalisation.var):
-                if len(values) != self.size:
-                    raise GymMaraError(f"the normalisation must have {self.size} numbers")
-
-    @property
-    def size(self) -> int:
-        """O, the length of an observation."""
-        return sum(part.size for part in self.observation)
-
-    @property
-    def layout(self) -> str:
-        """The parts of the observation with their sizes, for messages."""
-        return ", ".join(f"{part.name} ({part.size})" for part in self.observation)
-
-    def check(self, simulation: Simulation, *, any_robot: bool = False) -> None:
-        """Check that the policy can act in a simulation.
-
-        Args:
-            simulation: the simulation.
-            any_robot: whether the robot may differ from the one of the training in more than its name.
-
-        Raises:
-            GymMaraError: the robot or the observation is another one.
-        """
-        robot = simulation.robot
-        if robot.num_joints != len(self.joints):
-            raise GymMaraError(
-                f"the policy does not fit the environment: it moves {len(self.joints)} joints, "
-                f"and {robot.name} has {robot.num_joints}"
-            )
-        if not any_robot and fingerprint(robot) != self.robot:
-            raise GymMaraError(
-                f"the robot {robot.name!r} has changed since the training, and the policy was trained for the old one: "
-                "restore its files; or play the policy with the robot of today all the same, with --set robot=…"
-            )
-        parts = simulation.observation.parts
-        layout = [ObservationPart(part.name, len(part.low)) for part in parts]
-        if layout != self.observation or _groups(simulation) != self.groups:
-            theirs = ", ".join(f"{part.name} ({part.size})" for part in layout)
-            raise GymMaraError(
-                f"the policy does not fit the environment: it observes {self.layout}, and the environment "
-                f"has {theirs}"
-            )
 
 
 class Policy:
@@ -254,23 +148,6 @@ def read_policy(folder: Path, preset: Preset) -> Policy:
     return Policy(network, about)
 
 
-def read_description(folder: Path) -> PolicyDescription:
-    """The description of the policy in a folder.
-
-    Raises:
-        DamagedRunError: it is missing or damaged.
-    """
-    if (folder / "normalisation.json").exists():
-        raise DamagedRunError(
-            f"the policy in {str(folder)!r} is of an older version of gym_mara, which did not store what its actions "
-            "mean: train it again"
-        )
-    try:
-        return read_json(folder / "policy.json", PolicyDescription)
-    except DamagedFileError as error:
-        raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
-
-
 def _box(size: int) -> Box:
     return Box(-np.inf, np.inf, (size,), np.float64)
 
@@ -312,7 +189,8 @@ def save_policy(
         with writing(folder):
             temporary.mkdir(parents=True)
             model.save(temporary / "model.zip")
-            write_json(temporary / "policy.json", asdict(_description(model)))
+            about = described(base_env(model).env.simulation, _statistics(model))
+            write_json(temporary / "policy.json", asdict(about))
             for name, content in (extra or {}).items():
                 (temporary / name).write_bytes(content)
             replace_folder(temporary, folder)
@@ -320,32 +198,14 @@ def save_policy(
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _description(model: OnPolicyAlgorithm) -> PolicyDescription:
-    wrapped, simulation = normalisation(model), base_env(model).env.simulation
-    statistics = None
-    if wrapped.norm_obs:
-        running: Any = wrapped.obs_rms
-        mean, var = running.mean.tolist(), running.var.tolist()
-        statistics = Normalisation(mean, var, float(wrapped.epsilon), float(wrapped.clip_obs))
-    return PolicyDescription(
-        format=1,
-        joints=list(simulation.robot.joint_names),
-        low=simulation.action_space.low.tolist(),
-        high=simulation.action_space.high.tolist(),
-        observation=[ObservationPart(p.name, len(p.low)) for p in simulation.observation.parts],
-        groups=_groups(simulation),
-        normalisation=statistics,
-        robot=fingerprint(simulation.robot),
-        versions=versions(),
-    )
-
-
-def _groups(simulation: Simulation) -> dict[str, int] | None:
-    """The sizes of the entries of an observation that is a dictionary."""
-    space = simulation.observation_space
-    if not isinstance(space, Dict):
+def _statistics(model: OnPolicyAlgorithm) -> Normalisation | None:
+    """How a model's observations are normalised."""
+    wrapped = normalisation(model)
+    if not wrapped.norm_obs:
         return None
-    return {name: gymnasium.spaces.flatdim(entry) for name, entry in space.items()}
+    running: Any = wrapped.obs_rms
+    mean, var = running.mean.tolist(), running.var.tolist()
+    return Normalisation(mean, var, float(wrapped.epsilon), float(wrapped.clip_obs))
 
 
 def normalisation(model: Any) -> VecNormalize:

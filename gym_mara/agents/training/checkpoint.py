@@ -13,7 +13,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from gym_mara.agents.runs.archive import LARGEST
 from gym_mara.agents.runs.config import DamagedRunError
-from gym_mara.agents.runs.policy import base_env, normalisation, read_description
+from gym_mara.agents.runs.description import read_description
+from gym_mara.agents.runs.policy import base_env, normalisation
 from gym_mara.agents.runs.snapshot import decode, encode
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, read_bytes
