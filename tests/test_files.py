@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import resource
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +26,9 @@ from gym_mara.files import (
     write_text,
     written_aside,
 )
+
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass
@@ -91,6 +96,23 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     write_json(file, {"name": "é", "steps": 3})
     assert read_json(file, Form) == Form("é", 3)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_files_are_in_utf_8_whatever_the_locale(tmp_path: Path) -> None:
+    code = """
+from pathlib import Path
+from gym_mara.files import read_text, write_text
+write_text(Path("file"), "\\xb1\\u03c0")
+assert read_text(Path("file")) == "\\xb1\\u03c0"
+"""
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), **os.environ, **ascii_only},
+        check=True,
+    )
+    assert (tmp_path / "file").read_bytes() == "±π".encode()
 
 
 def test_a_new_file_replaces_no_other(tmp_path: Path) -> None:
