@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
+import secrets
 import shutil
 import stat
 from collections.abc import Iterator
@@ -22,7 +22,6 @@ T = TypeVar("T")
 LARGEST_TEXT = 2**24
 """The default bound on the size of a text file, bytes."""
 _SHOWN_ERRORS = 3
-_numbers = itertools.count()
 
 
 class DamagedFileError(GymMaraError):
@@ -182,7 +181,8 @@ def written_aside(file: Path, *, new: bool = False) -> Iterator[Path]:
         raise GymMaraError(f"cannot write {str(file)!r}: it exists and is not a plain file")
     if new and os.path.lexists(file):
         raise _exists(file)
-    temporary = file.with_name(f".{file.stem[:100]}-{os.getpid()}-{next(_numbers)}{file.suffix}")
+    # Nobody can guess this name, so nobody has put a link there that leads elsewhere.
+    temporary = file.with_name(f".{file.stem[:100]}-{secrets.token_hex(8)}{file.suffix}")
     try:
         with writing(file):
             yield temporary
@@ -194,6 +194,20 @@ def written_aside(file: Path, *, new: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def refuse_links(folder: Path) -> None:
+    """Check that a folder which is written to holds no symbolic links: they may lead out of it.
+
+    Raises:
+        DamagedFileError: it holds one.
+    """
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if os.path.islink(path := os.path.join(parent, name)):
+                raise DamagedFileError(
+                    f"{path!r} is a symbolic link, and is not written to: put the file or folder itself there"
+                )
 
 
 def replace_folder(new: Path, target: Path) -> None:

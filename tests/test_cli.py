@@ -20,6 +20,7 @@ from gym_mara.agents.experiments.grid import Grid
 from gym_mara.cli import common, experiments
 from gym_mara.cli.app import app
 from gym_mara.cli.common import whole
+from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
 from gym_mara.tasks import ReachTask, registry
 
@@ -390,3 +391,19 @@ def test_what_a_command_sets_itself_is_no_keyword(
     assert code == 2
     assert instead in err
     assert not (tmp_path / "run").exists()
+
+
+def test_an_error_is_one_line_without_control_characters(
+    gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hostile = "evil\x1b[2J\x07\nsecond\u202eline" + 10**6 * "x"
+
+    def fail(*_: object, **__: object) -> None:
+        raise GymMaraError(hostile)
+
+    monkeypatch.setattr("gym_mara.cli.app.app", fail)
+    code, _, err = gym_mara("list")
+    assert code == 2
+    assert err.startswith(r"error: evil\x1b[2J\x07 second\u202elinexxx")
+    assert err.count("\n") == 1
+    assert len(err) < 3000

@@ -32,6 +32,7 @@ def _done(*arguments: str, **options: object) -> subprocess.CompletedProcess[str
     [
         (signal.SIGINT, "1e6", "There is no checkpoint yet"),
         (signal.SIGTERM, "512", "The checkpoint at step"),
+        (signal.SIGHUP, "1e6", "There is no checkpoint yet"),
     ],
 )
 def test_an_interrupted_training_says_what_is_saved(

@@ -21,6 +21,7 @@ from gym_mara.files import (
     read_bytes,
     read_json,
     read_text,
+    refuse_links,
     write_json,
     write_text,
     written_aside,
@@ -165,3 +166,12 @@ def test_a_device_or_a_missing_folder_cannot_be_written(tmp_path: Path) -> None:
         write_text(Path("/dev/full"), "x")
     with pytest.raises(GymMaraError, match="No such file or directory"):
         write_text(tmp_path / "none" / "file", "x")
+
+
+def test_a_folder_with_a_link_at_any_depth_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "file").touch()
+    refuse_links(tmp_path)
+    (tmp_path / "a" / "b" / "link").symlink_to("/nowhere")
+    with pytest.raises(DamagedFileError, match="symbolic link"):
+        refuse_links(tmp_path)

@@ -81,7 +81,11 @@ class Backend(ABC):
 
     @abstractmethod
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Return to a snapshot of a backend of the same robot, size and settings."""
+        """Return to a snapshot of a backend of the same robot, size and settings.
+
+        Raises:
+            GymMaraError: it is of another backend. Nothing has changed then (`gym_mara.snapshots.check_fits`).
+        """
 
     def close(self) -> None:  # noqa: B027 - most have nothing to free
         """Free the engine; no other method is called afterwards."""

@@ -12,8 +12,9 @@ from gym_mara.collision import make_checker
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.cached import CachedChecker
 from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
-from gym_mara.errors import GymMaraError, positive_number
+from gym_mara.errors import positive_number
 from gym_mara.robot import RobotModel
+from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.types import Floats, Mask
 
@@ -158,9 +159,9 @@ class PinocchioBackend(Backend):
         return {name: copy.copy(getattr(self, f"_{name}")) for name in _STATE}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        if snapshot["q"].shape != self._q.shape:
-            raise GymMaraError(
-                f"the snapshot is of arms {snapshot['q'].shape}; these are {self._q.shape}"
-            )
+        form: dict[str, Any] = {name: getattr(self, f"_{name}") for name in _STATE}
+        not_yet = snapshot.get("collided") is None  # collisions are found when they are asked for
+        form["collided"] = type(None) if not_yet else self._touching
+        check_fits("backend", snapshot, form)
         for name in _STATE:
             setattr(self, f"_{name}", copy.copy(snapshot[name]))

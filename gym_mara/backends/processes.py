@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 import traceback
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -43,6 +44,7 @@ class Workers:
         self._pipes: list[Connection] = []
         self.processes: list[BaseProcess] = []
         self._owner = os.getpid()
+        self._in_use = threading.Lock()
         self._end = weakref.finalize(self, _end, self._owner, self._pipes, self.processes)
         with self._killed_on_failure():
             for core in _own_cores(count):
@@ -73,6 +75,7 @@ class Workers:
             The results, worker by worker.
 
         Raises:
+            GymMaraError: another thread, or the process that this one was forked from, uses the workers.
             WorkerDiedError: a worker has ended; then all are ended.
             Exception: the first that an object raised, with its traceback as the cause. The workers continue.
         """
@@ -82,10 +85,15 @@ class Workers:
             )
         if not self._end.alive:
             raise WorkerDiedError("the worker processes have ended; make a new environment")
-        with self._killed_on_failure():
-            for pipe, its_arguments in zip(self._pipes, arguments, strict=True):
-                pipe.send((name, its_arguments))
-            replies = self._replies()
+        if not self._in_use.acquire(blocking=False):  # it would take replies of the other thread
+            raise GymMaraError("another thread is using this environment: make one for each thread")
+        try:
+            with self._killed_on_failure():
+                for pipe, its_arguments in zip(self._pipes, arguments, strict=True):
+                    pipe.send((name, its_arguments))
+                replies = self._replies()
+        finally:
+            self._in_use.release()
         _check(replies)
         return replies
 

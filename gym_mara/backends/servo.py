@@ -11,6 +11,7 @@ import numpy as np
 from gym_mara.backends.base import Backend
 from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
+from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact, SimState
 from gym_mara.types import Floats, Mask
 
@@ -169,12 +170,14 @@ class ServoBackend(Backend):
         return {name: copy.deepcopy(getattr(self, f"_{name}")) for name in _STATE}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        if snapshot["q"].shape != self._q.shape:
-            raise GymMaraError(
-                f"the snapshot is of arms {snapshot['q'].shape}; these are {self._q.shape}"
-            )
+        check_fits("backend", snapshot, self._snapshot_form())
         for name in _STATE:
             setattr(self, f"_{name}", copy.deepcopy(snapshot[name]))
+
+    def _snapshot_form(self) -> dict[str, Any]:
+        """Examples of the values of a snapshot; a subclass adds its own."""
+        form: dict[str, Any] = {name: getattr(self, f"_{name}") for name in _STATE}
+        return form | {"contacts": [tuple] * self.num_envs}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self.robot, self.num_envs, self._settings, self.save())

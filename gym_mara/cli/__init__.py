@@ -15,7 +15,7 @@ from types import FrameType
 FAILED = 2
 """The exit code of a command that cannot do its work; 1 is for a check that found a difference."""
 INTERRUPTED = 130
-"""The exit code after Ctrl-C or SIGTERM."""
+"""The exit code after Ctrl-C, SIGTERM or SIGHUP."""
 
 
 def main() -> None:
@@ -74,7 +74,10 @@ def _output_failed(error: OSError) -> int:
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """Let SIGTERM do what Ctrl-C does: what is open is closed, and nothing is left half written."""
+    """Let SIGTERM, and SIGHUP of a closed terminal, do what Ctrl-C does: what is open is closed, nothing is half written.
+
+    A signal that is ignored, as SIGHUP under nohup, stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -84,8 +87,11 @@ def _terminated_like_interrupted() -> Iterator[None]:
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    endings = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    heard = [number for number in endings if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in heard}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -16,6 +16,9 @@ from gym_mara.errors import GymMaraError
 _UsageError: Any = typer.BadParameter.__base__
 
 
+_LONGEST_MESSAGE = 2000
+
+
 class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with interruptible("Interrupted."):
@@ -59,5 +62,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _failed(message: str) -> int:
-    err.print(Text.assemble(("error: ", "bold red"), message), soft_wrap=True)
+    # A message may quote what a stranger's file holds: line breaks, and control characters, which a terminal obeys.
+    line = " ".join(message.split())
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    if len(line) > _LONGEST_MESSAGE:
+        line = f"{line[:_LONGEST_MESSAGE]}…"
+    err.print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
     return FAILED

@@ -104,9 +104,16 @@ class GazeboMaraEnv(MaraEnv):
         return super().save_state() | {"episode_size": self._episode_size}
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Restore a snapshot of an environment with the same arguments."""
+        """Restore a snapshot of an environment with the same arguments.
+
+        Raises:
+            GymMaraError: it is of another environment. Nothing has changed then.
+        """
         super().restore_state(snapshot)
         self._episode_size = snapshot["episode_size"]
+
+    def _snapshot_form(self) -> dict[str, Any]:
+        return super()._snapshot_form() | {"episode_size": int}
 
 
 def _position_for_velocity(robot: RobotModel) -> Part:

@@ -21,6 +21,7 @@ from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.robot import RobotModel
+from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.types import Floats, Mask
@@ -262,6 +263,7 @@ class Simulation:
     def save(self) -> dict[str, Any]:
         """A snapshot of the arms, the sensors, the random generators, the goals and the statistics of the episodes."""
         return {
+            "made_with": self._made_with(),
             "backend": self.backend.save(),
             "statistics": copy.deepcopy(self.statistics),
             "sensors": self._sensors.save(),
@@ -270,9 +272,53 @@ class Simulation:
             "goal": (self.goal.position, self.goal.quaternion),
         }
 
-    def restore(self, snapshot: dict[str, Any]) -> None:
-        """Restore a snapshot."""
+    def check_snapshot(self, snapshot: Any, others: dict[str, Any]) -> None:
+        """Check that a snapshot fits this simulation, except for what the backend checks itself.
+
+        Args:
+            snapshot: the snapshot of an environment.
+            others: examples of the values that the environment has added to those of `save`.
+
+        Raises:
+            GymMaraError: it does not.
+            ClosedEnvironmentError: the environment is closed.
+        """
         self._check_open()
+        made_with = snapshot.get("made_with") if isinstance(snapshot, dict) else None
+        if made_with != self._made_with():
+            raise GymMaraError(
+                f"the snapshot is of (robot, backend, arms) {made_with}, and this environment is {self._made_with()}: "
+                "restore only what an environment with the same arguments has saved"
+            )
+        drawn, count = np.random.Generator, self.num_envs
+        sensors = self._sensors.save() | {"generators": dict}
+        form = {
+            "made_with": tuple,
+            "backend": dict,
+            "statistics": EpisodeStatistics,
+            "sensors": sensors,
+            "streams": tuple,
+            "started": bool,
+            "goal": (self.goal.position, self.goal.quaternion),
+        }
+        check_fits("snapshot", snapshot, form | others)
+        check_fits("statistics.steps", snapshot["statistics"].steps, self.statistics.steps)
+        arms = snapshot["sensors"]["generators"].keys() & range(count)
+        check_fits("generators", snapshot["sensors"]["generators"], dict.fromkeys(arms, drawn))
+        of_arm = Streams(*[drawn] * len(Streams._fields))  # type: ignore[arg-type]
+        check_fits(
+            "streams", snapshot["streams"], (of_arm,) * (count if snapshot["streams"] else 0)
+        )
+
+    def _made_with(self) -> tuple[str, str, int]:
+        return self.robot.name, self.backend_name, self.num_envs
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Restore a snapshot that `check_snapshot` has checked.
+
+        Raises:
+            GymMaraError: the backend's part does not fit. Nothing has changed then.
+        """
         self.backend.restore(snapshot["backend"])
         self.statistics = copy.deepcopy(snapshot["statistics"])
         self._sensors.restore(snapshot["sensors"])

@@ -148,12 +148,21 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Restore a snapshot of an environment with the same arguments."""
+        """Restore a snapshot of an environment with the same arguments.
+
+        Raises:
+            GymMaraError: it is of another environment. Nothing has changed then.
+        """
+        self.simulation.check_snapshot(snapshot, self._snapshot_form())
         self.simulation.restore(snapshot)
         steps = int(self.simulation.statistics.steps[0])
         self._time_limits.restore(snapshot["time_limits"], steps)
         self.np_random = copy.deepcopy(snapshot["np_random"])
         self._spawned_from = self.np_random if self.simulation.streams else None
+
+    def _snapshot_form(self) -> dict[str, Any]:
+        """Examples of the values of a snapshot that are not the simulation's."""
+        return {"np_random": np.random.Generator, "time_limits": list}
 
     def close(self) -> None:
         """Free the backend, the renderer and the viewer."""

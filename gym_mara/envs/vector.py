@@ -18,6 +18,7 @@ from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.files import short
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import MAX_EPISODE_STEPS, Task
@@ -97,19 +98,10 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         The other arms keep their last observation.
 
         Raises:
-            GymMaraError: the number of seeds is not N, the mask is not valid, or `options` has another key.
+            GymMaraError: the seeds or the mask are not valid, or `options` has another key. Nothing has changed then.
         """
         check_reset_options(options, ["reset_mask"])
-        seeds: Sequence[int | None] = [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            seeds = [int(seed) + index for index in range(self.num_envs)]
-        elif seed is not None:
-            if len(seed) != self.num_envs:
-                raise GymMaraError(
-                    f"{len(seed)} seeds for {self.num_envs} environments: give one seed per environment, or one int"
-                )
-            seeds = seed
-        super().reset(seed=seeds[0])
+        seeds = self._seeds(seed)
         mask = (options or {}).get("reset_mask")
         if mask is not None:
             mask = np.asarray(mask)
@@ -117,6 +109,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 raise GymMaraError(
                     f"reset_mask must be bool, of shape {(self.num_envs,)}, and select at least one arm"
                 )
+        super().reset(seed=seeds[0])
         chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
         self._ended[chosen] = False
         if self.simulation.random:
@@ -126,6 +119,31 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             observation = np.where(mask[:, None], observation, self._last)
         self._last = observation.copy()
         return self.simulation.present(observation), _vector_info(report, chosen)
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        """The seed of each arm.
+
+        Raises:
+            GymMaraError: it is neither None, one whole number, nor a sequence of N of these.
+        """
+        seeds = seed
+        if seed is None or isinstance(seed, (int, np.integer)):
+            shift = range(self.num_envs)
+            seeds = [None if seed is None else int(seed) + index for index in shift]
+        if not isinstance(seeds, (list, tuple, np.ndarray)):
+            raise GymMaraError(
+                f"seed must be None, a whole number or a list of these, not {short(seed)}"
+            )
+        if len(seeds) != self.num_envs:
+            raise GymMaraError(
+                f"{len(seeds)} seeds for {self.num_envs} environments: give one seed per environment, or one int"
+            )
+        for each in seeds:
+            if each is not None and not (isinstance(each, (int, np.integer)) and each >= 0):
+                raise GymMaraError(
+                    f"a seed must be None or a whole number of at least 0, not {short(each)}"
+                )
+        return [None if each is None else int(each) for each in seeds]
 
     def _seed(self, seeds: Sequence[int | None], chosen: Mask) -> None:
         """Set the streams of each arm to those of a MaraEnv with the arm's seed."""
@@ -217,7 +235,22 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
-        """Restore a snapshot of an environment with the same arguments."""
+        """Restore a snapshot of an environment with the same arguments.
+
+        Raises:
+            GymMaraError: it is of another environment. Nothing has changed then.
+        """
+        last = snapshot.get("last") if isinstance(snapshot, dict) else None
+        self.simulation.check_snapshot(
+            snapshot,
+            {
+                "ended": self._ended,
+                "last": type(None)
+                if last is None
+                else np.zeros((self.num_envs, *self.simulation.observation.space.shape)),
+                "np_random": np.random.Generator,
+            },
+        )
         self.simulation.restore(snapshot)
         self._ended = snapshot["ended"].copy()
         self._last = copy.copy(snapshot["last"])

@@ -245,6 +245,30 @@ def test_a_worker_that_dies_within_a_step_is_noticed() -> None:
     assert not any(process.is_alive() for process in backend.processes)
 
 
+def test_a_call_while_another_thread_steps_is_an_error_and_disturbs_nothing() -> None:
+    backend = _troubled()
+    ended: list[type[BaseException]] = []
+
+    def step() -> None:
+        try:
+            backend.step(_target(0.4))
+        except GymMaraError as error:
+            ended.append(type(error))
+
+    stepping = threading.Thread(target=step)
+    stepping.start()
+    while not backend._workers._in_use.locked():
+        time.sleep(0.001)
+    with pytest.raises(GymMaraError, match="another thread"):
+        backend.step(STILL)
+    assert not ended
+    assert stepping.is_alive()
+    for process in backend.processes:
+        process.kill()
+    stepping.join(10.0)
+    assert ended == [WorkerDiedError]
+
+
 def test_a_keyboard_interrupt_within_a_step_ends_the_workers() -> None:
     backend = _troubled()
     for process in backend.processes:

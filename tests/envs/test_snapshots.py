@@ -14,6 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gym_mara.compat.gym_gazebo2  # noqa: F401 - registers its ids
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.errors import GymMaraError
 from gym_mara.testing import COPIES, pickled
 
 STILL = np.zeros(6, np.float32)
@@ -178,3 +180,50 @@ def test_the_episode_size_of_gym_gazebo2_is_restored() -> None:
     env.set_episode_size(50)
     env.restore_state(snapshot)
     assert _length(env) == 5
+
+
+OTHERS: dict[str, Callable[[], Any]] = {
+    "another robot": lambda: _saved(MaraEnv(robot="ur5")),
+    "another backend": lambda: _saved(MaraEnv(backend="dart")),
+    "a batch": lambda: _saved(MaraVectorEnv(1)),
+    "a part is missing": lambda: {k: v for k, v in _saved(MaraEnv()).items() if k != "streams"},
+    "NaN": lambda: _with_backend(q=np.full((1, 6), np.nan)),
+    "no arrays": lambda: _with_backend(q=None),
+    "generators": lambda: _saved(MaraEnv()) | {"np_random": 3},
+    "nothing": lambda: None,
+}
+
+
+def _saved(env: Any) -> Any:
+    env.reset(seed=3)
+    snapshot = env.save_state()
+    env.close()
+    return snapshot
+
+
+def _with_backend(**changes: Any) -> dict[str, Any]:
+    snapshot = _saved(MaraEnv())
+    return snapshot | {"backend": snapshot["backend"] | changes}  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("make", OTHERS.values(), ids=OTHERS)
+def test_a_snapshot_of_another_environment_is_refused_and_changes_nothing(
+    make: Callable[[], Any],
+) -> None:
+    snapshot = make()
+    env, same = MaraEnv("MARARandomTarget-v0"), MaraEnv("MARARandomTarget-v0")
+    for each in (env, same):
+        each.reset(seed=1)
+    with pytest.raises(GymMaraError, match="snapshot"):
+        env.restore_state(snapshot)
+    assert _future(env, 1, 5) == _future(same, 1, 5)
+    assert repr(env.reset()) == repr(same.reset())
+
+
+@pytest.mark.parametrize("backend", ["pinocchio", "dart"])
+def test_a_snapshot_of_another_batch_is_refused(backend: str) -> None:
+    env = MaraVectorEnv(2, backend=backend)
+    env.reset(seed=1)
+    with pytest.raises(GymMaraError, match="arms"):
+        env.restore_state(_saved(MaraVectorEnv(3, backend=backend)))
+    env.close()

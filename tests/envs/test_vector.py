@@ -456,3 +456,22 @@ def test_a_dropped_environment_ends_its_worker_processes(name: str) -> None:
     del envs
     gc.collect()
     assert not any(process.is_alive() for process in processes)
+
+
+@pytest.mark.parametrize("seed", [-1, 5.0, "ab", b"ab", [0, -1], [0, "a"], [1.5, 2], {1: 2, 3: 4}])
+def test_a_wrong_seed_is_an_error_and_changes_nothing(seed: Any) -> None:
+    env, same = MaraVectorEnv(2, "MARARandomTarget-v0"), MaraVectorEnv(2, "MARARandomTarget-v0")
+    for each in (env, same):
+        each.reset(seed=1)
+    with pytest.raises(GymMaraError, match="seed"):
+        env.reset(seed=seed)
+    with pytest.raises(GymMaraError, match="reset_mask"):
+        env.reset(seed=7, options={"reset_mask": np.zeros(2, np.bool_)})
+    assert repr(env.reset()) == repr(same.reset())
+    assert env.np_random.random() == same.np_random.random()
+
+
+def test_seeds_may_be_numpys() -> None:
+    env = MaraVectorEnv(2, "MARARandomTarget-v0")
+    expected = env.reset(seed=[3, 4])[0]
+    assert np.array_equal(env.reset(seed=np.array([3, 4]))[0], expected)  # type: ignore[arg-type]

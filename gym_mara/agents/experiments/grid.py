@@ -256,6 +256,8 @@ def _trained(path: Path, config: RunConfig, on_progress: OnProgress) -> RunFolde
     """The run, trained to its end."""
     if not path.exists():
         return train(config, path, on_progress)
+    if path.is_symlink():
+        raise DamagedRunError(f"the run {str(path)!r} is a symbolic link, and is not written to")
     run = RunFolder.open(path)
     if replace(run.config, preset={}) != config:
         raise DamagedRunError(f"the run {str(path)!r} has another configuration than the grid")

@@ -121,6 +121,10 @@ def _check_log(folder: Path) -> None:
         DamagedFileError: the log is not a plain file, or is too large.
     """
     log = folder / _LOG
+    if log.is_symlink():
+        raise DamagedFileError(
+            f"{str(log)!r} is a symbolic link, not a plain file: choose another --out"
+        )
     try:
         text = read_bytes(log, _LARGEST_LOG)
     except MissingFileError:

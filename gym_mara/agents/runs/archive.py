@@ -85,6 +85,9 @@ def _tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
         for key, value in loaded.items()
     ):
         raise DamagedFileError(f"cannot read {name!r}: it holds more than weights")
+    # A tensor may show few numbers many times, and so be larger than its file.
+    if sum(value.numel() for value in loaded.values()) * 4 > LARGEST:
+        raise DamagedFileError(f"cannot read {name!r}: it holds more than {LARGEST:,} bytes")
     if not all(bool(value.isfinite().all()) for value in loaded.values()):
         raise DamagedFileError(f"cannot read {name!r}: a weight is not finite")
     return loaded

@@ -38,6 +38,7 @@ POLICIES = ("last", "best")
 _LIBRARIES = ("gym_mara", "gymnasium", "numpy", "pin", "stable_baselines3", "sb3_contrib", "torch")
 _ENGINES = ("coal", "dartpy", "python-fcl")  # recorded if installed
 _LARGEST_TABLE = 2**29
+_MOST_CELLS = 2 * 10**7
 _LARGEST_WHOLE = 10**15
 
 
@@ -154,14 +155,18 @@ def read_progress(file: Path) -> list[dict[str, float]]:
     try:
         text = read_text(file, _LARGEST_TABLE)
         text = text[: text.rfind("\n") + 1]  # a full disk may have cut the last row
-        rows = list(csv.DictReader(io.StringIO(text, newline="")))
-        if any(None in row for row in rows):
-            raise ValueError("a row has more cells than the table has columns")
-        complete = [row for row in rows if row.get(_STEPS)]
-        numbers = [{k: _number(v) for k, v in row.items() if k and v} for row in complete]
-        for row in numbers:
-            if not 0 <= row[_STEPS] <= _LARGEST_WHOLE:
-                raise ValueError(f"{_STEPS} is {row[_STEPS]}")
+        numbers, cells = [], 0
+        for row in csv.DictReader(io.StringIO(text, newline="")):
+            if None in row:
+                raise ValueError("a row has more cells than the table has columns")
+            if not row.get(_STEPS):
+                continue
+            cells += len(row)
+            if cells > _MOST_CELLS:
+                raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
+            numbers.append({k: _number(v) for k, v in row.items() if k and v})
+            if not 0 <= numbers[-1][_STEPS] <= _LARGEST_WHOLE:
+                raise ValueError(f"{_STEPS} is {numbers[-1][_STEPS]}")
         return numbers
     except (csv.Error, ValueError) as error:
         raise DamagedRunError(f"the table {str(file)!r} is damaged: {error}") from error

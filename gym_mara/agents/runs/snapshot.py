@@ -19,6 +19,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError
+from gym_mara.state import Contact
 
 _FIRST_LINE = b"gym_mara snapshot 1\n"
 _KINDS = "biuf"
@@ -29,7 +30,7 @@ def encode(tree: Any) -> bytes:
     """Encode a tree of these types, and of no subclass of them.
 
     None, bool, int, float, str; list, tuple, dict, deque; numpy's numbers, arrays and PCG64 generators; torch's tensors;
-    Streams and EpisodeStatistics.
+    Streams, EpisodeStatistics and Contact.
 
     Raises:
         GymMaraError: a value has another type.
@@ -77,6 +78,8 @@ def _encoded(value: Any, arrays: list[NDArray[Any]]) -> Any:
         return {"deque": [value.maxlen, items(value)]}
     if kind is Streams:
         return {"streams": items(value)}
+    if kind is Contact:
+        return {"contact": items(value)}
     if kind is EpisodeStatistics:
         return {"statistics": _array(value.__reduce__()[1][0], arrays)}
     if kind is np.ndarray and value.dtype.kind in _KINDS:
@@ -136,6 +139,9 @@ class _Reader:
     def _streams(self, about: Any) -> Streams:
         return Streams(*self._list(about))
 
+    def _contact(self, about: Any) -> Contact:
+        return Contact(*self._list(about))
+
     def _statistics(self, about: Any) -> EpisodeStatistics:
         array = self._array(about)
         restored = EpisodeStatistics(array.shape[1])
@@ -176,6 +182,7 @@ _FORMS = (
     "dict",
     "deque",
     "streams",
+    "contact",
     "statistics",
     "array",
     "number",

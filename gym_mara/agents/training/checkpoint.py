@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.spaces import Dict, Space
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
@@ -18,6 +20,7 @@ from gym_mara.agents.runs.policy import base_env, normalisation
 from gym_mara.agents.runs.snapshot import decode, encode
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, read_bytes
+from gym_mara.snapshots import check_fits
 
 STATE_FILE = "state.bin"
 _OLD_STATE_FILE = "state.pkl"
@@ -84,6 +87,7 @@ def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
         )
     try:
         state = decode(read_bytes(checkpoint / STATE_FILE, 4 * LARGEST))
+        _check(model, state)
         return _restore(model, state)
     except (
         DamagedFileError,
@@ -99,6 +103,48 @@ def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
         ) from error
 
 
+def _check(model: OnPolicyAlgorithm, state: Any) -> None:
+    """Check all of a state that the environment and torch do not check themselves.
+
+    Raises:
+        GymMaraError: a value has another form than in a state of this model, or is out of range.
+    """
+    wrapped = normalisation(model)
+    observation = _batch(model.observation_space, wrapped.num_envs)
+    form = {
+        "progress": [0.0, 0.0],
+        "parameters": dict,
+        "attributes": {
+            "num_timesteps": 0,
+            "_n_updates": 0,
+            "_episode_num": 0,
+            "_current_progress_remaining": 0.0,
+            "_last_obs": observation,
+            "_last_original_obs": observation,
+            "_last_episode_starts": np.zeros(wrapped.num_envs, np.bool_),
+            "ep_info_buffer": deque,
+            "ep_success_buffer": deque,
+        },
+        "statistics": {name: vars(v) for name, v in vars(wrapped).items() if name in _STATISTICS},
+        "returns": wrapped.returns,
+        "env": {"env": dict, "returns": wrapped.returns},
+        "random": list,
+    }
+    check_fits("state", state, form)
+    episodes = state["attributes"]["ep_info_buffer"]
+    check_fits("ep_info_buffer", episodes, deque([{"r": 0.0, "l": 0, "t": 0.0}] * len(episodes)))
+    for name, running in state["statistics"].items():
+        if not (running["count"] > 0.0 and bool(np.all(running["var"] >= 0.0))):
+            raise GymMaraError(f"the statistics {name!r} are out of range")
+
+
+def _batch(space: Space[Any], size: int) -> Any:
+    """A batch of observations of a space."""
+    if isinstance(space, Dict):
+        return {name: _batch(each, size) for name, each in space.items()}
+    return np.zeros((size, *(space.shape or ())))
+
+
 def _restore(model: OnPolicyAlgorithm, state: dict[str, Any]) -> Progress:
     wrapped = normalisation(model)
     model.set_parameters(state["parameters"], exact_match=True, device="cpu")
@@ -106,8 +152,6 @@ def _restore(model: OnPolicyAlgorithm, state: dict[str, Any]) -> Progress:
         setattr(model, name, state["attributes"][name])
     for name, values in state["statistics"].items():
         running: RunningMeanStd = getattr(wrapped, name)
-        if set(values) != set(vars(running)) or values["mean"].shape != running.mean.shape:
-            raise GymMaraError(f"the statistics {name!r} have another form")
         vars(running).update(values)
     wrapped.returns = state["returns"]
     base_env(model).restore_state(state["env"])

@@ -7,6 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from gym_mara.agents.runs.folder import RunFolder, read_progress
+from gym_mara.files import written_aside
 
 
 def plot_learning_curve(run: RunFolder) -> Path:
@@ -31,5 +32,6 @@ def plot_learning_curve(run: RunFolder) -> Path:
     config = run.config
     figure.suptitle(f"{config.algo.upper()} on {config.env}, {config.backend}, seed {config.seed}")
     file = run.path / "learning_curve.png"
-    figure.savefig(file, dpi=120)
+    with written_aside(file) as aside:
+        figure.savefig(aside, dpi=120)
     return file

@@ -30,13 +30,13 @@ from gym_mara.agents.algorithms.registry import (
     algorithm,
 )
 from gym_mara.agents.runs.evaluation import make_env
-from gym_mara.agents.runs.folder import RunConfig, RunFolder, read_progress
+from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
-from gym_mara.files import locked
+from gym_mara.files import DamagedFileError, locked, refuse_links
 
 
 def train(
@@ -81,10 +81,15 @@ def resume(path: Path, on_progress: OnProgress) -> RunFolder:
     """Resume a run from its last checkpoint. The result is the same as without the interruption.
 
     Raises:
-        GymMaraError: the folder holds no run, the run is damaged or has finished, or another process trains it.
+        GymMaraError: the folder holds no run, the run is damaged or has finished, another process trains it, or a symbolic
+            link is in it.
         TrainingDivergedError: the agent's parameters are no longer finite.
     """
     run = RunFolder.open(path)
+    try:
+        refuse_links(path)
+    except DamagedFileError as error:
+        raise DamagedRunError(str(error)) from None
     with _locked(run):
         return _resume(run, on_progress)
 
@@ -98,6 +103,10 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
     model = new_model(config)
     try:
         reached = restore_state(model, checkpoints[-1]) if checkpoints else _NOTHING
+        if model.num_timesteps != run.trained_steps():
+            raise DamagedRunError(
+                f"the checkpoint {str(checkpoints[-1])!r} is of step {model.num_timesteps}: give it its own name"
+            )
     except BaseException:
         base_env(model).close()
         raise

@@ -154,6 +154,9 @@ class DartBackend(ServoBackend):
     def save(self) -> dict[str, Any]:
         return super().save() | {"targets": self._targets.copy()}
 
+    def _snapshot_form(self) -> dict[str, Any]:
+        return super()._snapshot_form() | {"targets": self._targets}
+
     def restore(self, snapshot: dict[str, Any]) -> None:
         super().restore(snapshot)
         self._targets = copy.copy(snapshot["targets"])

@@ -211,6 +211,14 @@ def test_a_pipe_or_an_endless_log_is_refused_at_once(tmp_path: Path) -> None:
             open_study(SMALL, tmp_path / name)
 
 
+def test_a_log_that_is_a_link_is_not_written_to(tmp_path: Path) -> None:
+    (tmp_path / "search").mkdir()
+    (tmp_path / "search" / "study.log").symlink_to(tmp_path / "outside")
+    with pytest.raises(GymMaraError, match="symbolic link"):
+        open_study(SMALL, tmp_path / "search")
+    assert not (tmp_path / "outside").exists()
+
+
 def test_a_line_that_was_cut_off_does_not_end_the_search(tmp_path: Path) -> None:
     open_study(SMALL, tmp_path)
     with (tmp_path / "study.log").open("ab") as stream:

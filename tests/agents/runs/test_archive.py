@@ -114,3 +114,9 @@ def test_a_file_that_is_no_archive_is_an_error(tmp_path: Path, content: bytes) -
 def test_an_archive_without_weights_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DamagedFileError, match=r"no policy.pth"):
         read_weights(archive(tmp_path, {"data": b"{}"}))
+
+
+def test_a_tensor_that_repeats_few_numbers_is_refused_in_little_memory(tmp_path: Path) -> None:
+    weights = {"bomb": torch.zeros(1).expand(200_000, 200_000)}
+    with pytest.raises(DamagedFileError, match="more than"):
+        read_weights(archive(tmp_path, {"policy.pth": saved(weights)}))

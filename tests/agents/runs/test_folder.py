@@ -72,3 +72,15 @@ def test_a_full_disk_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(GymMaraError, match=r"cannot write .*config.json.*No space left"):
         RunFolder.create(tmp_path / "run", config())
     assert not (tmp_path / "run").exists()
+
+
+def test_a_table_with_too_many_cells_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gym_mara.agents.runs.folder._MOST_CELLS", 5)
+    table = tmp_path / "progress.csv"
+    table.write_text("time/total_timesteps,a\n" + "1,2\n" * 2)
+    assert len(read_progress(table)) == 2
+    table.write_text("time/total_timesteps,a\n" + "1,2\n" * 3)
+    with pytest.raises(DamagedRunError, match="more than 5 cells"):
+        read_progress(table)

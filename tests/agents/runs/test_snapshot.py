@@ -20,6 +20,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError
+from gym_mara.state import Contact
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 ARRAYS: Any = st.sampled_from(["<f8", "<f4", ">f8", "<i8", "|u1", "|b1"]).flatmap(
@@ -167,3 +168,9 @@ def forged(text: bytes) -> None:
     first_line = encode(0).split(b"\n", 1)[0] + b"\n"
     with pytest.raises(DamagedFileError, match="no snapshot"):
         decode(first_line + hashlib.sha256(rest).digest() + rest)
+
+
+def test_contacts_come_back() -> None:
+    contacts = [(), (Contact(("base", "tool"), 0.001),)]
+    assert decode(encode(contacts)) == contacts
+    assert type(decode(encode(contacts))[1][0]) is Contact

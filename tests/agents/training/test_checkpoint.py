@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pickle
 import shutil
+from collections import deque
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +16,10 @@ import pytest
 from gym_mara.agents.runs.config import DamagedRunError
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import base_env, save_policy
+from gym_mara.agents.runs.snapshot import decode, encode
 from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, encoded_state, restore_state
 from gym_mara.agents.training.train import new_model, preset_of, resume
+from gym_mara.envs.statistics import EpisodeStatistics
 from tests.agents.conftest import config, silent
 
 REACHED = Progress(best=1.5, elapsed=2.5)
@@ -90,3 +95,61 @@ def test_a_checkpoint_of_an_older_version_is_refused_in_plain_words(unfinished: 
     (folder / STATE_FILE).rename(folder / "state.pkl")
     with pytest.raises(DamagedRunError, match=r"older version.*pickle: train the run again"):
         resume(unfinished.path, silent)
+
+
+def _changed(*path: Any, to: Any) -> Callable[[Any], None]:
+    """Change a value in a state."""
+
+    def change(state: Any) -> None:
+        *parents, last = path
+        for key in parents:
+            state = state[key]
+        state[last] = to
+
+    return change
+
+
+HOSTILE: dict[str, Callable[[Any], None]] = {
+    "observation NaN": _changed("attributes", "_last_obs", to=np.full((256, 16), np.nan)),
+    "observation shape": _changed("attributes", "_last_obs", to=np.zeros((3, 3))),
+    "text for steps": _changed("attributes", "num_timesteps", to="abc"),
+    "steps of another checkpoint": _changed("attributes", "num_timesteps", to=-(10**6)),
+    "updates": _changed("attributes", "_n_updates", to="x"),
+    "episodes": _changed("attributes", "ep_info_buffer", to=5),
+    "an episode": _changed("attributes", "ep_info_buffer", to=deque([{"r": "x"}])),
+    "returns NaN": _changed("returns", to=np.full(256, np.nan)),
+    "returns shape": _changed("env", "returns", to=np.zeros(3)),
+    "variance": _changed("statistics", "ret_rms", "var", to=np.float64(-1.0)),
+    "best": _changed("progress", to=[float("nan"), 1.0]),
+    "joint positions NaN": _changed("env", "env", "backend", "q", to=np.full((256, 6), np.nan)),
+    "goal": _changed("env", "env", "goal", to=(np.zeros((1, 3)), np.zeros((1, 4)))),
+    "statistics": _changed("env", "env", "statistics", to=EpisodeStatistics(3)),
+    "generator": _changed("env", "env", "np_random", to=5),
+    "ended": _changed("env", "env", "ended", to=np.ones(256)),
+}
+
+
+@pytest.mark.parametrize("change", HOSTILE.values(), ids=HOSTILE)
+def test_a_state_with_a_wrong_value_is_an_error(
+    unfinished: RunFolder, change: Callable[[Any], None]
+) -> None:
+    file = unfinished.checkpoints()[-1] / STATE_FILE
+    state = decode(file.read_bytes())
+    change(state)
+    file.write_bytes(encode(state))
+    with pytest.raises(DamagedRunError, match="checkpoint"):
+        resume(unfinished.path, silent)
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "learning_curve.png", "last", "checkpoints/1.new"])
+def test_nothing_is_written_through_a_link_in_a_run(unfinished: RunFolder, name: str) -> None:
+    link = unfinished.path / name
+    outside = unfinished.path.parent / "outside"
+    outside.mkdir()
+    if link.is_dir():
+        shutil.rmtree(link)
+    link.unlink(missing_ok=True)
+    link.symlink_to(outside / "new" if name.endswith(".png") else outside)
+    with pytest.raises(DamagedRunError, match="symbolic link"):
+        resume(unfinished.path, silent)
+    assert not list(outside.iterdir())

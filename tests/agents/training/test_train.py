@@ -179,7 +179,7 @@ def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"algo": "pop"}, "unknown algorithm 'pop'. Did you mean 'ppo'"),
-        ({"env": "MARA-v9"}, "unknown task 'MARA-v9'.*MARACollision-v0"),
+        ({"env": "MARA-v9"}, "unknown environment 'MARA-v9'.*MARACollision-v0"),
         ({"backend": "gazebo"}, "unknown backend 'gazebo'.*pinocchio"),
         ({"steps": 0}, "steps must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
@@ -455,7 +455,7 @@ def test_a_run_in_a_read_only_folder_is_not_resumed(
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(FileLock, "_acquire", refuse)
-    with pytest.raises(GymMaraError, match=r"cannot write to .*Read-only"):
+    with pytest.raises(GymMaraError, match=r"cannot lock .*Read-only"):
         resume(finished_run.path, silent)
 
 
