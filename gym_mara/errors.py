@@ -84,7 +84,7 @@ def positive_number(
         return number
     because = "" if "finite" in allowed else f", because {reason}"
     in_units = f" ({unit})" if unit else ""
-    raise GymMaraError(f"{name} must be {allowed}{in_units}{because}, not {_shown(value)}")
+    raise GymMaraError(f"{name} must be {allowed}{in_units}{because}, not {short(value, 200)}")
 
 
 def whole_number(
@@ -113,11 +113,11 @@ def whole_number(
     if number < 1:
         other = f", or {or_else}" if or_else else ""
         raise GymMaraError(
-            f"{name} must be a whole number of at least 1{other}, not {_shown(value)}"
+            f"{name} must be a whole number of at least 1{other}, not {short(value, 200)}"
         )
     if number > at_most:
         raise GymMaraError(
-            f"{name} must be at most {at_most}, because {reason}; not {_shown(value)}"
+            f"{name} must be at most {at_most}, because {reason}; not {short(value, 200)}"
         )
     return number
 
@@ -130,7 +130,7 @@ def flag(name: str, value: Any) -> bool:
     """
     plain = _plain(value)
     if not isinstance(plain, (bool, np.bool_)):
-        raise GymMaraError(f"{name} must be True or False, not {_shown(value)}")
+        raise GymMaraError(f"{name} must be True or False, not {short(value, 200)}")
     return bool(plain)
 
 
@@ -153,7 +153,7 @@ def finite_numbers(name: str, values: Any, count: int | None = None) -> list[flo
     if not (good and bool((np.abs(array.astype(np.float64)) <= LARGEST).all())):
         many = f"{count} " if count else ""
         raise GymMaraError(
-            f"{name} must be a list of {many}finite numbers, each within ±{LARGEST:g}, not {_shown(values)}"
+            f"{name} must be a list of {many}finite numbers, each within ±{LARGEST:g}, not {short(values, 200)}"
         )
     return [float(value) for value in array]
 
@@ -170,13 +170,13 @@ def one_of(kind: str, name: object, valid: Iterable[str]) -> str:
     return str(name)
 
 
-def _shown(value: Any) -> str:
-    """The representation of a value, cut off if it is long."""
+def short(value: Any, longest: int = 60) -> str:
+    """The value for an error message, in at most this many characters."""
     try:
         text = repr(value)
-    except ValueError:  # Python does not print thousands of digits
-        return "a number of thousands of digits"
-    return text if len(text) <= 200 else f"{text[:200]}…"
+    except ValueError:  # an integer with more digits than Python prints
+        return "a huge number"
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, short
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -138,15 +138,6 @@ def _first_errors(error: ValidationError) -> str:
         shown.append(f"{where}: {text}" if where else text)
     more = len(found) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more else "")
-
-
-def short(value: Any) -> str:
-    """The value for an error message, in at most 60 characters."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer with more digits than Python prints
-        return "a huge number"
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def write_text(file: Path, text: str, *, new: bool = False) -> None:

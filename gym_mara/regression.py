@@ -24,8 +24,8 @@ from gym_mara.backends import DEFAULT_BACKEND, backend_settings
 from gym_mara.envs import make_vector_env
 from gym_mara.envs.goal import GoalSettings
 from gym_mara.envs.simulation import Simulation
-from gym_mara.errors import GymMaraError, unknown, whole_number
-from gym_mara.files import DamagedFileError, parsed_json, read_text, short, write_text
+from gym_mara.errors import GymMaraError, short, unknown, whole_number
+from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
 from gym_mara.registration import environment
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.robot.model import is_path

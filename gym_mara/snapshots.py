@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.errors import GymMaraError
-from gym_mara.files import short
+from gym_mara.errors import GymMaraError, short
 
 
 def check_fits(name: str, value: Any, like: Any) -> None:

@@ -359,6 +359,7 @@ def run_calls(seeds: range, originals: Path, folder: Path) -> list[str]:
         return [text for text in pool.map(check, seeds) if text]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(300)], ids=["300 calls"])
 def test_hostile_calls(seeds: range, originals: Path, tmp_path: Path) -> None:
     found = run_calls(seeds, originals, tmp_path)

@@ -173,7 +173,7 @@ def transfer(
         "highest speed, rad/s",
     )
     titles = [Column(row.backend.replace(", ", ",\n"), justify="right") for row in rows]
-    table = Table("", *titles, title=f"{folder.config.env}, {policy} policy")
+    table = Table("", *titles, title=", ".join([folder.config.env, f"{policy} policy", *settings]))
     for index, name in enumerate(names, start=1):
         table.add_row(name, *(_mean_and_spread(np.asarray(row[index])) for row in rows))
     out.print(table)

@@ -17,8 +17,7 @@ from gym_mara.envs.simulation import Outcome, Simulation
 from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import view_of
-from gym_mara.errors import GymMaraError, unknown, whole_number
-from gym_mara.files import short
+from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import MAX_EPISODE_STEPS, Task

@@ -19,8 +19,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from gym_mara.errors import GymMaraError
-from gym_mara.files import plain_size, short
+from gym_mara.errors import GymMaraError, short
+from gym_mara.files import plain_size
 
 # More than any robot has; the number of pairs of shapes grows with the square.
 _MOST = {"link": 1000, "joint": 1000, "collision": 500}

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 
-from gym_mara.errors import GymMaraError, unknown
-from gym_mara.files import short
+from gym_mara.errors import GymMaraError, short, unknown
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm

@@ -28,13 +28,12 @@ from gym_mara.agents.runs.folder import (
 from gym_mara.agents.training.callbacks import OnProgress
 from gym_mara.agents.training.train import resume, train
 from gym_mara.backends import DEFAULT_BACKEND, backend_names
-from gym_mara.errors import GymMaraError, unknown, whole_number
+from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import (
     DamagedFileError,
     MissingFileError,
     locked,
     read_json,
-    short,
     write_json,
     writing,
 )

@@ -25,14 +25,13 @@ from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.errors import GymMaraError, TrainingDivergedError, unknown, whole_number
+from gym_mara.errors import GymMaraError, TrainingDivergedError, short, unknown, whole_number
 from gym_mara.files import (
     BusyError,
     DamagedFileError,
     MissingFileError,
     locked,
     read_bytes,
-    short,
     writing,
     written_aside,
 )

@@ -29,7 +29,7 @@ class Transferred(NamedTuple):
     """How a policy did on one backend; each array is (N,), over N episodes."""
 
     backend: str
-    """Its name, and the settings that differ from its defaults."""
+    """Its name, and its settings that differ from its defaults."""
     position_error_mm: Floats
     """At the last step."""
     angle_deg: Floats
@@ -109,8 +109,9 @@ def _play(
     with Player(run, backend, options, which=which, episodes=episodes) as player:
         played = roll_out(player)
         robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
+    own = (f"{key}={value}" for key, value in chosen.items() if key in backend_settings(backend))
     row = Transferred(
-        backend=", ".join([backend, *(f"{key}={value}" for key, value in chosen.items())]),
+        backend=", ".join([backend, *own]),
         position_error_mm=1000.0 * played.position_error[-1],
         angle_deg=np.degrees(played.angle_error[-1]),
         return_=played.reward.sum(axis=0),

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 from gym_mara.agents.algorithms.base import Preset, plain_values
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
-from gym_mara.errors import GymMaraError
-from gym_mara.files import DamagedFileError, parsed_json, read_json, short
+from gym_mara.errors import GymMaraError, short
+from gym_mara.files import DamagedFileError, parsed_json, read_json
 from gym_mara.rendering import RenderSettings
 from gym_mara.robot.model import is_path
 
