@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -100,9 +101,9 @@ def test_whole_numbers_of_numpy_are_accepted(
 )
 @pytest.mark.parametrize(("make", "name"), _arguments(float))
 def test_numbers_of_numpy_are_accepted(make: Callable[..., Any], name: str, value: Any) -> None:
-    value = value.dtype.type(0.001) if name == "physics_step" else value
-    if name == "physics_step" and abs(float(value) - 0.001) > 1e-11:
-        pytest.skip("this type has no 0.001 that divides the control period")
+    if name == "physics_step":  # it must divide the control period, and be short
+        value = np.asarray(value) / 128
+        make = partial(make, control_period=1 / 64)
     _make(make, name, value)
 
 
@@ -122,7 +123,8 @@ def test_names_that_do_not_exist_are_refused(
     make: Callable[..., Any], name: str, value: Any
 ) -> None:
     if name == "viewer_host" and isinstance(value, str):
-        pytest.skip("any text can be an address")
+        _make(make, name, value)  # any text can be an address
+        return
     with pytest.raises(GymMaraError):
         _make(make, name, value)
 
