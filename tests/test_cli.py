@@ -88,6 +88,7 @@ def test_a_setting_that_looks_like_json_must_be_json(gym_mara: Cli, tmp_path: Pa
     assert not run.exists()
 
 
+@pytest.mark.slow
 def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     run = tmp_path / "run"
     code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "4096", "--out", run)
