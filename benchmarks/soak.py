@@ -15,6 +15,7 @@ import copy
 import gc
 import pickle
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -47,14 +48,18 @@ class Tally:
     """What one scenario has done, and what was wrong."""
 
     done: Counter[str] = field(default_factory=Counter)
+    _counting: threading.Lock = field(default_factory=threading.Lock)
     wrong: Counter[str] = field(default_factory=Counter)
 
     def observe(self, space: gymnasium.Space[Any], observation: Any, reward: Any) -> None:
         """Count a step, NaN, and observations outside their space."""
-        self.done["steps"] += int(np.size(reward))
         parts = [*observation.values()] if isinstance(observation, dict) else [observation]
-        self.wrong["NaN"] += int(not all(np.isfinite(part).all() for part in (*parts, reward)))
-        self.wrong["outside the space"] += int(not space.contains(observation))
+        finite = all(np.isfinite(part).all() for part in (*parts, reward))
+        inside = space.contains(observation)
+        with self._counting:  # three threads count
+            self.done["steps"] += int(np.size(reward))
+            self.wrong["NaN"] += int(not finite)
+            self.wrong["outside the space"] += int(not inside)
 
     def compare(self, first: list[Any], again: list[Any]) -> None:
         """Count a comparison of two futures that must be equal."""
@@ -132,7 +137,7 @@ def _step(env: Any, action: Any, tally: Tally) -> Any:
     return [observation, reward, terminated, truncated]
 
 
-def threads(seed: int, tally: Tally, *, backend: str) -> None:
+def in_threads(seed: int, tally: Tally, *, backend: str) -> None:
     """Steps three equal environments at the same time in three threads; their results must be equal."""
 
     def play(_: int) -> list[Any]:
@@ -191,7 +196,7 @@ def scenarios() -> dict[str, Callable[[int, Tally], None]]:
         found[f"{backend}, {ARMS} arms of MARAGoal-v0"] = partial(
             vector, backend=backend, mode=AutoresetMode.SAME_STEP, name="MARAGoal-v0"
         )
-        found[f"{backend}, three threads"] = partial(threads, backend=backend)
+        found[f"{backend}, three threads"] = partial(in_threads, backend=backend)
     same_step = AutoresetMode.SAME_STEP
     found["dart, two worker processes"] = partial(vector, backend="dart", mode=same_step, workers=2)
     found["pinocchio, limited joint speed"] = partial(
