@@ -249,7 +249,10 @@ def writing(path: Path) -> Iterator[None]:
     except (OSError, UnicodeError) as error:
         if isinstance(error, GymMaraError):
             raise
-        raise GymMaraError(f"cannot write {str(path)!r}: {_reason(error)}") from error
+        why = _reason(error)
+        if not path.parent.is_dir():
+            why = f"there is no folder {str(path.parent)!r}; make it first"
+        raise GymMaraError(f"cannot write {str(path)!r}: {why}") from error
 
 
 def _to_disk(file: Path) -> None:

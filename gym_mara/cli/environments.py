@@ -94,7 +94,13 @@ def rewards(
         regression.write(record, made)
         out.print(f"{states} states of {made.env} on {made.backend} recorded in {record}")
     if check is not None:
-        refuse(context, "--check takes these from the record", "env", "states", "settings")
+        refuse(
+            context,
+            "--check takes the environment, its keyword arguments and the states from the record",
+            "env",
+            "states",
+            "settings",
+        )
         moved = regression.check(check, backend, tolerance)
         for value in moved:
             print(value)

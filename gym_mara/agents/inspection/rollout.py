@@ -14,7 +14,7 @@ from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
 from gym_mara.backends import backend_settings
 from gym_mara.envs.simulation import Outcome
-from gym_mara.tasks import MAX_EPISODE_STEPS
+from gym_mara.registration import environment
 from gym_mara.types import Floats, Mask
 
 VELOCITY_LIMIT = "max_joint_velocity"
@@ -48,6 +48,8 @@ class Player:
     ) -> None:
         config = run.config
         self.policy = load_policy(run, which)
+        self.episode_steps = environment(config.env).max_episode_steps
+        """The length of an episode, steps."""
         self.env = make_arms(config.env, backend, episodes, options, max_episode_steps=None)
         try:
             self.policy.check(self.env.simulation, any_robot=chose_robot(options))
@@ -116,9 +118,9 @@ class Trajectory:
     """(T, N)."""
 
 
-def roll_out(player: Player, steps: int = MAX_EPISODE_STEPS) -> Trajectory:
-    """Let a player's policy act for this many steps."""
-    rows = [_row(player.step()) for _ in range(steps)]
+def roll_out(player: Player, steps: int | None = None) -> Trajectory:
+    """Let a player's policy act for this many steps; by default for the length of an episode."""
+    rows = [_row(player.step()) for _ in range(steps or player.episode_steps)]
     period = player.env.simulation.backend.control_period
     return Trajectory(period, *map(np.array, zip(*rows, strict=True)))
 

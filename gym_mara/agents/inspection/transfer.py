@@ -41,7 +41,7 @@ class Transferred(NamedTuple):
     highest_torque: Floats
     """Of any joint, relative to its limit; NaN on a backend without dynamics."""
     highest_velocity: Floats
-    """Of any joint, rad/s."""
+    """Of any joint, rad/s; NaN where the joints teleport."""
 
 
 def transfer(
@@ -57,8 +57,9 @@ def transfer(
             backend; a setting of backends goes to those that know it.
 
     Returns:
-        A row for each backend. A backend whose joints teleport and that can limit their velocity has a second row, with the
-        robot's lowest velocity limit for all joints.
+        A row for each backend with its defaults. A row before it has the settings of the training, if it had some. A
+        backend whose joints teleport and that can limit their velocity has a further row, with the robot's lowest velocity
+        limit for all joints.
 
     Raises:
         GymMaraError: the policy is missing or damaged, or an option is unknown or out of range.
@@ -77,6 +78,9 @@ def transfer(
     rows = []
     for name, known in settings.items():
         chosen = {key: value for key, value in given.items() if key in everywhere or key in known}
+        trained = run.config.env_options if name == run.config.backend else {}
+        if own := {key: value for key, value in trained.items() if key in known}:
+            rows.append(_play(run, name, of_env, {**own, **chosen}, episodes, which)[0])
         row, velocity_limit = _play(run, name, of_env, chosen, episodes, which)
         rows.append(row)
         if velocity_limit is not None:
@@ -109,6 +113,7 @@ def _play(
     with Player(run, backend, options, which=which, episodes=episodes) as player:
         played = roll_out(player)
         robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
+        teleports = player.env.simulation.backend.teleports
     own = (f"{key}={value}" for key, value in chosen.items() if key in backend_settings(backend))
     row = Transferred(
         backend=", ".join([backend, *own]),
@@ -118,7 +123,7 @@ def _play(
         collisions=played.collided.sum(axis=0, dtype=np.float64),
         settling_time_s=settling_time(played.position_error, played.period),
         highest_torque=np.abs(played.torque / robot.effort_limit).max(axis=(0, 2)),
-        highest_velocity=np.abs(played.qd).max(axis=(0, 2)),
+        highest_velocity=np.abs(played.qd).max(axis=(0, 2)) + (np.nan if teleports else 0.0),
     )
     return row, velocity_limit
 

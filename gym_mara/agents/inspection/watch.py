@@ -52,29 +52,30 @@ def film_run(
     """
     check_film_path(path)  # an error comes before the policy is played
     with ExitStack() as stack:
-        players = []
+        players, labels = [], []
         for backend in backends:
             settings = _settings(run, backend, options, which, log) | {"render_mode": "rgb_array"}
             players.append(stack.enter_context(Player(run, backend, settings, which=which)))
+            limit = settings.get(VELOCITY_LIMIT)
+            labels.append(backend if limit is None else f"{backend}, at most {limit:.3g} rad/s")
         period = players[0].env.simulation.backend.control_period
         every = math.ceil(speed / period / rate)
         film = stack.enter_context(Film(path, speed / period / every))
-        start = _side_by_side(players)
+        start = _side_by_side(players, labels)
         for _ in range(math.ceil(_STILL * speed / period / every)):
             film.add(start)
         for step in range(1, math.ceil(seconds / period) + 1):
             for player in players:
                 player.step()
             if step % every == 0:
-                film.add(_side_by_side(players))
+                film.add(_side_by_side(players, labels))
 
 
-def _side_by_side(players: list[Player]) -> Any:
-    """The players' pictures in one; if there are several, each with the name of its backend."""
+def _side_by_side(players: list[Player], labels: list[str]) -> Any:
+    """The players' pictures in one; if there are several, each with its label."""
     pictures = [pictures[0] for player in players if (pictures := player.env.render())]
     if len(players) > 1:
-        names = [player.env.simulation.backend_name for player in players]
-        pictures = [labelled(*pair) for pair in zip(pictures, names, strict=True)]
+        pictures = [labelled(*pair) for pair in zip(pictures, labels, strict=True)]
     return np.concatenate(pictures, axis=1)
 
 

@@ -87,7 +87,9 @@ class RunFolder:
         """
         file = path / "config.json"
         if not file.is_file():
-            raise DamagedRunError(f"{str(path)!r} is not a run folder: it has no config.json")
+            raise DamagedRunError(
+                f"{str(path)!r} is not a run folder, such as runs/first: it has no config.json"
+            )
         try:
             config = read_config(file)
             config.made_preset()
@@ -133,6 +135,7 @@ class RunFolder:
         if not self.has_policy(which):
             raise GymMaraError(
                 f"the run {str(self.path)!r} has no {which!r} policy: it has not finished; resume it with --resume"
+                + (", or give --policy best" if which == "last" and self.has_policy("best") else "")
             )
         return folder
 

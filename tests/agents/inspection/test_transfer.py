@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from gym_mara.agents.inspection import transfer as module
-from gym_mara.agents.inspection.rollout import roll_out
+from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.transfer import settling_time, transfer
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.training.train import train
 from gym_mara.errors import GymMaraError
+from tests.agents.conftest import ROLLOUT, config, silent
 
 PERIOD = 0.1
 
@@ -49,6 +52,27 @@ def test_an_option_of_the_task_counts_on_every_backend(
     assert all(("servo_gain" in title) == title.startswith("dart") for title in titles)
     before = {row.backend: row for row in transfer(finished_run)}
     assert rows[0].position_error_mm != before["dart"].position_error_mm
+
+
+def test_the_settings_of_the_training_have_a_row(tmp_path: Path) -> None:
+    slow = train(
+        config(steps=ROLLOUT, env_options={"max_joint_velocity": 0.5}), tmp_path / "run", silent
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "roll_out", partial(roll_out, steps=5))
+        titles = [row.backend for row in transfer(slow)]
+    limits = [title.partition("max_joint_velocity=")[2] for title in titles]
+    assert titles[0] == "dart"
+    assert limits[1:] == ["0.5", "", "1.57"]
+
+
+def test_an_episode_has_the_length_of_the_environment(tmp_path: Path) -> None:
+    dense = {"reward_type": "dense"}
+    run = train(
+        config(env="MARAGoal-v0", steps=ROLLOUT, env_options=dense), tmp_path / "run", silent
+    )
+    with Player(run, "pinocchio", dense) as player:
+        assert len(roll_out(player).reward) == 50
 
 
 @pytest.mark.parametrize("name", ["target_positon", "camera", "task", "num_envs", "render_mode"])
