@@ -13,6 +13,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import motion_axis
 from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -133,17 +134,25 @@ class MujocoBackend(ServoBackend):
 
     def save(self) -> dict[str, Any]:
         """A snapshot, with MuJoCo's state of every arm (N, S)."""
-        states = np.empty((self.num_envs, mujoco.mj_stateSize(self._model, _STATE)))
+        states = self._empty_states()
         for arm, state in zip(self._arms, states, strict=True):
             mujoco.mj_getState(self._model, arm, state, _STATE)
         return super().save() | {"states": states}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        """Return to a snapshot; MuJoCo computes again what follows from a state."""
+        """Return to a snapshot; MuJoCo computes again what follows from a state.
+
+        Raises:
+            GymMaraError: it does not fit. Nothing has changed then.
+        """
+        check_fits("states", snapshot.get("states"), self._empty_states())
         super().restore(snapshot)
         for arm, state in zip(self._arms, snapshot["states"], strict=True):
             mujoco.mj_setState(self._model, arm, state, _STATE)
             mujoco.mj_step1(self._model, arm)
+
+    def _empty_states(self) -> Floats:
+        return np.zeros((self.num_envs, mujoco.mj_stateSize(self._model, _STATE)))
 
 
 def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:

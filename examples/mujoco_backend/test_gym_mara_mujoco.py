@@ -211,7 +211,7 @@ def test_a_bad_setting_is_an_error(settings: dict[str, Any], message: str) -> No
 
 
 def test_a_snapshot_of_other_arms_is_refused(mara: RobotModel) -> None:
-    with pytest.raises(GymMaraError, match="the snapshot is of"):
+    with pytest.raises(GymMaraError, match="of the snapshot does not fit"):
         MujocoBackend(mara, 2).restore(MujocoBackend(mara, 3).save())
 
 

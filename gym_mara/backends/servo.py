@@ -170,14 +170,12 @@ class ServoBackend(Backend):
         return {name: copy.deepcopy(getattr(self, f"_{name}")) for name in _STATE}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        check_fits("backend", snapshot, self._snapshot_form())
+        form: dict[str, Any] = {name: getattr(self, f"_{name}") for name in _STATE}
+        form["contacts"] = [tuple] * self.num_envs
+        # A subclass adds values to the snapshot, and checks them itself.
+        check_fits("backend", {name: snapshot.get(name) for name in _STATE}, form)
         for name in _STATE:
             setattr(self, f"_{name}", copy.deepcopy(snapshot[name]))
-
-    def _snapshot_form(self) -> dict[str, Any]:
-        """Examples of the values of a snapshot; a subclass adds its own."""
-        form: dict[str, Any] = {name: getattr(self, f"_{name}") for name in _STATE}
-        return form | {"contacts": [tuple] * self.num_envs}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self.robot, self.num_envs, self._settings, self.save())

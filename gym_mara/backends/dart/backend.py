@@ -14,6 +14,7 @@ from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import Motion, ServoBackend, servo_motion
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.robot import RobotModel
+from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact, SimState
 from gym_mara.types import Floats, Mask
 
@@ -154,10 +155,8 @@ class DartBackend(ServoBackend):
     def save(self) -> dict[str, Any]:
         return super().save() | {"targets": self._targets.copy()}
 
-    def _snapshot_form(self) -> dict[str, Any]:
-        return super()._snapshot_form() | {"targets": self._targets}
-
     def restore(self, snapshot: dict[str, Any]) -> None:
+        check_fits("targets", snapshot.get("targets"), self._targets)
         super().restore(snapshot)
         self._targets = copy.copy(snapshot["targets"])
         for index, arm in enumerate(self.arms):
