@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from gym_mara.backends import DEFAULT_BACKEND, backend_settings
-from gym_mara.envs import make_vector_env
+from gym_mara.envs import MaraVectorEnv, make_vector_env
 from gym_mara.envs.goal import GoalSettings
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
@@ -99,11 +99,11 @@ def record(
     """
     if not 2 <= whole_number("states", states) <= MOST_STATES:
         raise GymMaraError(f"states must be from 2 to {MOST_STATES:,}, not {short(states)}")
-    simulation = _simulation(env, backend, options or {}, 1)
+    arms = _arms(env, backend, options or {}, 1)
     try:
-        q = _sample_q(simulation, states)
+        q = _sample_q(arms.simulation, states)
     finally:
-        simulation.close()
+        arms.close()
     return compute(env, backend, options or {}, q)
 
 
@@ -117,13 +117,13 @@ def compute(env: str, backend: str, options: dict[str, Any], q: Floats) -> Recor
     if q.ndim != 2 or len(q) < 1:
         raise GymMaraError("a record needs at least one state")
     blocks = [q[start : start + _BLOCK] for start in range(0, len(q), _BLOCK)]
-    simulation = _simulation(env, backend, options, len(blocks[0]))
+    arms = _arms(env, backend, options, len(blocks[0]))
     try:
         for number, row in enumerate(q):
-            simulation.robot.checked_q(row, f"state {number} of the record")
-        values = [_values(simulation, block) for block in blocks]
+            arms.simulation.robot.checked_q(row, f"state {number} of the record")
+        values = [_values(arms.simulation, block) for block in blocks]
     finally:
-        simulation.close()
+        arms.close()
     columns = {name: np.concatenate([part[name] for part in values]) for name in values[0]}
     return Record(env, backend, options, q, columns)
 
@@ -281,10 +281,10 @@ def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
             raise unknown("keyword argument", name, known, " of a reward record")
 
 
-def _simulation(env: str, backend: str, options: dict[str, Any], num_envs: int) -> Simulation:
-    """A simulation of N arms, from the keyword arguments of an environment."""
+def _arms(env: str, backend: str, options: dict[str, Any], num_envs: int) -> MaraVectorEnv:
+    """N arms, from the keyword arguments of an environment."""
     _check_options(env, backend, options)
-    return make_vector_env(env, num_envs, backend=backend, **options).simulation
+    return make_vector_env(env, num_envs, backend=backend, **options)
 
 
 def _sample_q(simulation: Simulation, states: int) -> Floats:

@@ -41,7 +41,8 @@ def watch(
     """
     from gym_mara.viewer.viewer import Viewer
 
-    simulation = make_vector_env(env, 1, backend=backend, **keywords).simulation
+    arms = make_vector_env(env, 1, backend=backend, **keywords)
+    simulation = arms.simulation
     viewer: Viewer | None = None
     try:
         simulation.streams = (Streams.seeded(seed),)
@@ -56,4 +57,4 @@ def watch(
     finally:
         if viewer is not None:
             viewer.close()
-        simulation.close()
+        arms.close()
