@@ -408,3 +408,15 @@ def test_an_error_is_one_line_without_control_characters(
     assert err.startswith(r"error: evil\x1b[2J\x07 second\u202elinexxx")
     assert err.count("\n") == 1
     assert len(err) < 3000
+
+
+def test_an_interrupt_while_the_arguments_are_read_ends_the_command(
+    gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gym_mara.cli.app._Commands.parse_args", interrupt)
+    code, _, err = gym_mara("list")
+    assert code == 130
+    assert "Traceback" not in err

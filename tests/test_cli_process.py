@@ -51,8 +51,8 @@ def test_an_interrupted_training_says_what_is_saved(
             time.sleep(0.02)
         training.send_signal(number)
         training.communicate(timeout=60)
-    assert training.returncode == 130
     text = errors.read_text()
+    assert training.returncode == 130, text
     assert text.startswith(f"Interrupted. {message}")
     assert text.count("\n") == 1
     assert f"gym-mara train --resume {run}" in text

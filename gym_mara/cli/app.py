@@ -49,6 +49,8 @@ def run(arguments: list[str]) -> int:
     try:
         code = app(arguments, prog_name="gym-mara", standalone_mode=False)
         return code if isinstance(code, int) else 0
+    except typer.Abort:  # of Typer, for a Ctrl-C while it reads the arguments
+        raise KeyboardInterrupt from None
     except GymMaraError as error:
         return _failed(str(error))
     except _UsageError as error:
