@@ -21,15 +21,12 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from gym_mara.backends import DEFAULT_BACKEND, backend_settings
-from gym_mara.envs import MaraVectorEnv, make_vector_env
-from gym_mara.envs.goal import GoalSettings
+from gym_mara.envs import MaraVectorEnv, make_vector_env, task_keywords
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
-from gym_mara.registration import environment
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.robot.model import is_path
-from gym_mara.tasks import named_task
 from gym_mara.types import Floats
 
 MOST_STATES = 100_000
@@ -272,10 +269,7 @@ def _check_tolerance(tolerance: float) -> None:
 
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
     """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
-    made = environment(env)
-    forms: list[Any] = [named_task(made.task), *([GoalSettings] if made.goals else [])]
-    of_env = [field.name for form in forms for field in dataclasses.fields(form)]
-    known = {"robot", "ee_frame", *of_env, *backend_settings(backend)} - {"workers"}
+    known = {"robot", "ee_frame", *task_keywords(env), *backend_settings(backend)} - {"workers"}
     for name in options:
         if name not in known:
             raise unknown("keyword argument", name, known, " of a reward record")

@@ -121,8 +121,7 @@ def benchmark(
     folder = out_folder or Path("runs") / f"benchmark_{preset}"
     open_grid(folder, grid)
     with interruptible(
-        "Interrupted. Finished runs are kept, the others resume from their last checkpoint: "
-        "run the same command again"
+        "Interrupted. Finished runs and checkpoints are kept: run the same command again to go on from them"
     ):
         view = _GridView(folder, grid)
         with Live(get_renderable=view.table, console=out, refresh_per_second=2) as live:

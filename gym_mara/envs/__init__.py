@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
-from gym_mara.envs.goal import MaraGoalEnv, MaraGoalVectorEnv
+from gym_mara.envs.goal import GoalSettings, MaraGoalEnv, MaraGoalVectorEnv
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
 from gym_mara.registration import environment
+from gym_mara.tasks import named_task
 
-__all__ = ["MaraEnv", "MaraGoalEnv", "MaraGoalVectorEnv", "MaraVectorEnv", "make_vector_env"]
+__all__ = [
+    "MaraEnv",
+    "MaraGoalEnv",
+    "MaraGoalVectorEnv",
+    "MaraVectorEnv",
+    "make_vector_env",
+    "task_keywords",
+]
+
+
+def task_keywords(name: str) -> set[str]:
+    """The names of the keyword arguments that the task and the goals of an environment have.
+
+    Raises:
+        GymMaraError: the name of the environment is unknown.
+    """
+    made = environment(name)
+    forms: list[Any] = [named_task(made.task), *([GoalSettings] if made.goals else [])]
+    return {field.name for form in forms for field in dataclasses.fields(form)}
 
 
 def make_vector_env(name: str, num_envs: int, **options: Any) -> MaraVectorEnv:

@@ -1,4 +1,4 @@
-"""Checks that an action consists of joint targets."""
+"""The actions of an arm: joint targets."""
 
 from __future__ import annotations
 
@@ -6,10 +6,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
 from gym_mara.types import UnitActions
+
+
+def action_space(robot: RobotModel) -> Box[np.float32]:
+    """The actions of the paper, ±π for every revolute joint; of a prismatic joint the whole travel, m."""
+    prismatic = robot.kinematics().prismatic
+    low, high = np.where(prismatic, robot.lower, -np.pi), np.where(prismatic, robot.upper, np.pi)
+    return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def joint_targets(action: ArrayLike) -> NDArray[Any]:

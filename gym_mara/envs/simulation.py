@@ -8,19 +8,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.spaces import Box, Space
+from gymnasium.spaces import Space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
 from gym_mara.backends import backend_settings, make_backend
-from gym_mara.envs.actions import joint_targets
+from gym_mara.envs.actions import action_space, joint_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers, whole_number
-from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
@@ -87,7 +86,7 @@ class Simulation:
         )
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
-        self.action_space = _action_space(self.robot)
+        self.action_space = action_space(self.robot)
         # The range of joint targets: the intersection of the action space and the joint limits, rad (m).
         self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
         self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
@@ -332,13 +331,6 @@ class Simulation:
         if not self._closed:
             self._closed = True
             self.backend.close()
-
-
-def _action_space(robot: RobotModel) -> Box[np.float32]:
-    """The actions of the paper, ±π for every revolute joint; of a prismatic joint the whole travel, m."""
-    prismatic = robot.kinematics().prismatic
-    low, high = np.where(prismatic, robot.lower, -np.pi), np.where(prismatic, robot.upper, np.pi)
-    return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def _sensor_noise(state: SimState) -> Floats | None:

@@ -41,16 +41,6 @@ POSITIONS: tuple[Any, ...] = (
 QUATERNIONS: tuple[Any, ...] = ([0] * 4, [math.nan] * 4, [1e300] * 4, [1e-300] * 4, [1, 0], None)
 
 
-@pytest.fixture
-def loop() -> Iterator[Loop]:
-    stepping = Loop()
-    stepping.start()
-    try:
-        yield stepping
-    finally:
-        stepping.stop()
-
-
 @contextlib.contextmanager
 def connected(loop: Loop, host: str = "127.0.0.1", origin: str | None = None) -> Iterator[Any]:
     """A websocket to the viewer, as one opens it under this name of the machine, from a page of this origin."""

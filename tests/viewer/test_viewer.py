@@ -31,16 +31,6 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
-    stepping = Loop()
-    stepping.start()
-    try:
-        yield stepping
-    finally:
-        stepping.stop()
-
-
-@pytest.fixture
 def page(browser: Browser, loop: Loop) -> Iterator[Page]:
     opened = browser.new_page(viewport={"width": 900, "height": 700})
     opened.goto(loop.viewer.url)

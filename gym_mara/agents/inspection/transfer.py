@@ -12,11 +12,9 @@ from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, installed_backends
-from gym_mara.envs.goal import GoalSettings
+from gym_mara.envs import task_keywords
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown, whole_number
-from gym_mara.registration import environment
-from gym_mara.tasks import named_task
 from gym_mara.types import Floats
 
 SETTLED = 0.005
@@ -70,7 +68,8 @@ def transfer(
     for reason in reasons:
         warnings.warn(reason, stacklevel=2)
     settings = {name: backend_settings(name) for name in installed}
-    everywhere = _names_of_env(run.config.env)
+    sensors = {field.name for field in fields(SensorSettings)}
+    everywhere = {"robot", "ee_frame", *task_keywords(run.config.env), *sensors}
     for name in given:
         valid = everywhere.union(*settings.values())
         if name not in valid:
@@ -87,17 +86,6 @@ def transfer(
             limited = {**chosen, VELOCITY_LIMIT: velocity_limit}
             rows.append(_play(run, name, of_env, limited, episodes, which)[0])
     return rows
-
-
-def _names_of_env(env: str) -> set[str]:
-    """The keyword arguments of an environment that every backend knows, without those of pictures."""
-    made = environment(env)
-    forms: list[Any] = [
-        named_task(made.task),
-        SensorSettings,
-        *([GoalSettings] if made.goals else []),
-    ]
-    return {"robot", "ee_frame", *(field.name for form in forms for field in fields(form))}
 
 
 def _play(
