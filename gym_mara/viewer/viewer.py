@@ -138,10 +138,11 @@ class Viewer:
         """Notify the connected browsers and stop the server."""
         clients = self._server.get_clients().values()
         for client in clients:
-            client.add_notification(
-                "Closed", "The environment was closed; the arm no longer moves."
-            )
-            client.flush()
+            with _sender_errors_ignored():
+                client.add_notification(
+                    "Closed", "The environment was closed; the arm no longer moves."
+                )
+                client.flush()
         if clients:
             time.sleep(_CLOSING_TIME)
         self._server.stop()
@@ -213,14 +214,16 @@ class Viewer:
 
 @contextmanager
 def _sender_errors_ignored() -> Iterator[None]:
-    """Ignore a race in viser: it wakes its sender thread through an asyncio event that is not thread-safe.
+    """Ignore two races in viser.
 
-    The message is already queued, and the next message wakes the sender.
+    It wakes its sender thread through an asyncio event that is not thread-safe: the message is already queued, and the next
+    message wakes the sender. And it warns of a message to a browser that has just disconnected, which is an exception
+    where warnings are errors.
     """
     try:
         yield
-    except RuntimeError as error:
-        if "deque mutated" not in str(error):
+    except (RuntimeError, UserWarning) as error:
+        if "deque mutated" not in str(error) and "closed connection" not in str(error):
             raise
 
 
