@@ -87,6 +87,7 @@ def train(
 ) -> None:
     """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log. Needs the extra train."""
     with needs_agents():
+        from gym_mara.agents.runs.evaluation import episodes_to_judge
         from gym_mara.agents.runs.folder import RunConfig, RunFolder
         from gym_mara.agents.training.train import resume as resume_training
         from gym_mara.agents.training.train import train as start_training
@@ -116,7 +117,7 @@ def train(
         )
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress)
-    _print_evaluation(run, episodes=1)
+    _print_evaluation(run, episodes=episodes_to_judge(run.config))
     if (trained := run.trained_steps()) > run.config.steps:
         out.print(f"Trained {trained:,} steps: an update needs a whole rollout of all arms.")
     out.print(f"Run folder: {run.path}", soft_wrap=True)

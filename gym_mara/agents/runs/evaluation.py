@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,17 +22,18 @@ from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
-
 MOST_EPISODES = 100_000
+RANDOM_EPISODES = 5
+"""How many episodes judge a policy where they are random: as many as in Stable-Baselines3's `EvalCallback`."""
 
 
 def make_arms(
     env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: int | None
 ) -> MaraVectorEnv:
-    """N arms of an environment, in at most as many processes as arms; `limit` may be another `max_episode_steps`."""
+    """N arms of an environment, in at most `workers` processes, a divisor of N; `limit` may be `max_episode_steps`."""
     workers = options.get("workers")
-    if type(workers) is int and workers > num_envs:
-        options = {**options, "workers": num_envs}
+    if type(workers) is int and workers > 0:
+        options = {**options, "workers": math.gcd(workers, num_envs)}
     return make_vector_env(
         env, num_envs, backend=backend, autoreset_mode="SameStep", **limit, **options
     )
@@ -43,6 +45,15 @@ def make_env(
     """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
     arms = make_arms(env, backend, num_envs, options, **limit)
     return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
+
+
+def episodes_to_judge(config: RunConfig) -> int:
+    """How many episodes judge a policy of this run: one where all are the same, else RANDOM_EPISODES."""
+    env = make_arms(config.env, config.backend, 1, config.env_options)
+    try:
+        return RANDOM_EPISODES if env.simulation.random else 1
+    finally:
+        env.close()
 
 
 def evaluate_run(

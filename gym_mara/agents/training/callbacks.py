@@ -9,7 +9,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from gym_mara.agents.runs.evaluation import make_env, play
+from gym_mara.agents.runs.evaluation import episodes_to_judge, make_env, play
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import base_env, normalisation, save_policy
 from gym_mara.agents.sb3 import MaraVecEnv
@@ -45,7 +45,8 @@ class CheckpointCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._next = self.num_timesteps + self.run.config.checkpoint_every
         config = self.run.config
-        self._eval_env = make_env(config.env, config.backend, 1, config.env_options)
+        episodes = episodes_to_judge(config)
+        self._eval_env = make_env(config.env, config.backend, episodes, config.env_options)
 
     def _on_rollout_start(self) -> None:
         # The model's own count: Stable-Baselines3 updates the callback's only during the rollout.

@@ -97,7 +97,7 @@ def test_transfer_plays_a_policy_on_every_backend(dynamic_run: RunFolder) -> Non
     assert dynamic.highest_torque[0] != dynamic.highest_torque[1]
     assert (dynamic.highest_velocity > 0.1).all()
     assert np.isnan(teleport.highest_torque).all()
-    assert (teleport.highest_velocity == 0.0).all()
+    assert np.isnan(teleport.highest_velocity).all()
     played = evaluate_run(dynamic_run, backend="pinocchio", episodes=1)
     np.testing.assert_allclose(teleport.return_[0], played["return"][0], rtol=1e-4)
     np.testing.assert_allclose(

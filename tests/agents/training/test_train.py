@@ -26,7 +26,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from gym_mara.agents.algorithms.base import Preset
 from gym_mara.agents.algorithms.registry import algorithm
 from gym_mara.agents.runs.archive import read_weights
-from gym_mara.agents.runs.evaluation import METRICS, evaluate_run, make_env, spread
+from gym_mara.agents.runs.evaluation import (
+    METRICS,
+    RANDOM_EPISODES,
+    episodes_to_judge,
+    evaluate_run,
+    make_arms,
+    make_env,
+    spread,
+)
 from gym_mara.agents.runs.folder import DamagedRunError, RunFolder, read_progress
 from gym_mara.agents.sb3 import MaraVecEnv
 from gym_mara.agents.training import callbacks
@@ -75,6 +83,30 @@ def test_a_run_writes_all_its_files(finished_run: RunFolder) -> None:
 def test_the_same_seed_trains_the_same_policy(finished_run: RunFolder, tmp_path: Path) -> None:
     again = train(config(), tmp_path / "run", silent)
     assert_same_training(finished_run, again)
+
+
+def test_random_episodes_are_judged_by_several(tmp_path: Path) -> None:
+    few = config(env="MARARandomTarget-v0", steps=ROLLOUT, env_options={"max_joint_velocity": 1.57})
+    run = train(few, tmp_path / "run", silent)
+    assert episodes_to_judge(run.config) == RANDOM_EPISODES > 1
+    (judged,) = (r for r in read_progress(run.progress_file) if "eval/reward_per_step" in r)
+    metrics = evaluate_run(run, episodes=RANDOM_EPISODES)
+    assert np.ptp(metrics["position_error_mm"]) > 1.0
+    for name, values in metrics.items():
+        np.testing.assert_allclose(judged[f"eval/{name}"], values.mean(), rtol=1e-4)
+
+
+def test_equal_episodes_are_judged_by_one(finished_run: RunFolder) -> None:
+    assert episodes_to_judge(finished_run.config) == 1
+
+
+@pytest.mark.parametrize(("arms", "processes"), [(1, 1), (5, 1), (6, 2)])
+def test_arms_have_as_many_processes_as_divide_them(arms: int, processes: int) -> None:
+    made = make_arms("MARA-v0", "dart", arms, {"workers": 2})
+    try:
+        assert len(getattr(made.simulation.backend, "processes", [None])) == processes
+    finally:
+        made.close()
 
 
 def test_another_seed_trains_another_policy(finished_run: RunFolder, tmp_path: Path) -> None:
