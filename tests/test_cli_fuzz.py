@@ -230,7 +230,9 @@ def prepare(folder: Path, originals: Path, call: list[str], choose: random.Rando
 
 def damage(path: Path, choose: random.Random) -> None:
     """Damage a file, or a file of a folder."""
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():  # the files that mark a lock are empty
+        files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size)
     texts = [p for p in files if p.suffix in (".json", ".csv")]
     file = choose.choice(texts if texts and choose.random() < 0.7 else files)
     content = file.read_bytes()
