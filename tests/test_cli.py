@@ -61,6 +61,7 @@ def test_list_shows_everything(gym_mara: Cli) -> None:
     assert all(environment_id(name) in out for name in environment_names())
     assert "pinocchio" in out
     assert "ur5" in out
+    assert "they make MARA, with 6 joints: a motor makes a joint at each of its two faces" in out
     words = out.split()  # a narrow terminal wraps the lines
     assert all(name in words for name in ALGORITHMS)
     assert all(set(entry.summary.split()) <= set(words) for entry in ALGORITHMS.values())

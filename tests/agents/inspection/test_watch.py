@@ -22,7 +22,7 @@ from gym_mara.agents.inspection.report import write_report
 from gym_mara.agents.inspection.watch import film_run, watch_run
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.errors import GymMaraError, MissingExtraError
-from gym_mara.rendering.film import Film
+from gym_mara.rendering.film import Film, labelled
 from tests.browser import chromium
 from tests.helpers import robot_model, started
 
@@ -65,7 +65,16 @@ def test_a_film_shows_the_start_of_an_episode(
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_two_backends_are_filmed_side_by_side(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names: list[str] = []
+
+    def noted(picture: Any, text: str) -> Any:
+        names.append(text)
+        return labelled(picture, text)
+
+    monkeypatch.setattr(watch_module, "labelled", noted)
     film = tmp_path / "film.mp4"
     film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
     shown = pictures(film)
@@ -73,6 +82,7 @@ def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path:
     label, scene = np.s_[:18], np.s_[18:]
     start = shown[0]
     assert differing(start[label, :160], start[label, 160:]) > 0.01, "each side has its name"
+    assert names[:2] == ["pinocchio, at most 1.57 rad/s", "dart"]
     assert differing(start[scene, :160], start[scene, 160:]) < 0.001
     assert differing(shown[-1, scene, :160], shown[-1, scene, 160:]) > 0.0005
 
