@@ -214,6 +214,7 @@ def test_an_option_of_rewards_without_effect_is_an_error(
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
         (["train", "--steps", "nan"], "'--steps': must be a whole number"),
+        (["train", "--steps", "1M"], "such as 300000 or 3e5, not '1M'"),
         (["train", "--set", "robot"], "write NAME=VALUE"),
         (["train", "--set", "robot=ur55"], "Did you mean 'ur5'"),
         (

@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -81,6 +83,15 @@ def test_the_readme_says_beside_make_vec_how_stable_baselines3_takes_it() -> Non
     lines = README.read_text(encoding="utf-8").splitlines()
     [place] = [number for number, line in enumerate(lines) if "gymnasium.make_vec(" in line]
     assert "MaraVecEnv" in "".join(lines[place : place + 2])
+
+
+def test_each_side_of_the_film_of_both_backends_has_its_name() -> None:
+    with Image.open(ROOT / "docs" / "media" / "both_backends.gif") as film:
+        picture = np.asarray(film.convert("L"))
+    height, width = picture.shape
+    for left in (0, width // 2):
+        corner = picture[: height // 10, left : left + width // 8]
+        assert (corner < 100).sum() > 50, "dark letters"
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # from vi
 @pytest.fixture
 def shown() -> Iterator[Loop]:
     """A viewer whose program stands still."""
-    loop = Loop()
+    loop = Loop(max_joint_velocity=1.2345)  # rad/s, so that positions have many decimals
     yield loop
     loop.env.close()
 

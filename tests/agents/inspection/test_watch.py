@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 from pathlib import Path
@@ -17,12 +19,14 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
 from gym_mara.agents.inspection.watch import film_run, watch_run
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film, labelled
+from tests.agents.conftest import config
 from tests.browser import chromium
 from tests.helpers import robot_model, started
 
@@ -242,6 +246,20 @@ def test_a_report_does_not_overwrite_another_file(finished_run: RunFolder, tmp_p
     assert mine.read_text() == "kept"
     with pytest.raises(GymMaraError, match=r"cannot write.*no folder"):
         write_report(finished_run, tmp_path / "missing" / "report.html")
+
+
+def test_a_full_disk_ends_a_report_with_a_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(run: RunFolder, path: Path, *_: Any, **__: Any) -> None:
+        path.write_text("a half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(report_module, "film_run", full)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(GymMaraError, match=r"cannot write .*No space left"):
+        report_module._video(RunFolder(tmp_path, config()), ["pinocchio"], "last")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
