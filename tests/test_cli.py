@@ -331,7 +331,7 @@ def _numbers() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("command", "option"), _numbers())
-@pytest.mark.parametrize("value", ["nan", "-inf", "1e300", "9" * 5000, "-1", "1M", "", "0x10"])
+@pytest.mark.parametrize("value", ["nan", "-inf", "1e23", "9" * 5000, "-1", "1M", "", "0x10"])
 def test_every_number_has_a_range(gym_mara: Cli, command: str, option: str, value: str) -> None:
     needed = [] if command in ("train", "benchmark", "search", "watch", "rewards") else ["run"]
     code, _, err = gym_mara(command, *needed, option, value)

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 import urllib.request
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,22 @@ def test_a_full_disk_ends_a_film_with_a_clear_error(tmp_path: Path, suffix: str)
     )
     assert str(film) in answer.stdout
     assert len(answer.stdout.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_an_encoder_reports_in_many_lines_is_told_in_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(picture: Any) -> None:
+        raise OSError("broken pipe\nffmpeg version\nfailed")
+
+    with ExitStack() as stack:
+        refused = stack.enter_context(pytest.raises(GymMaraError))
+        film = stack.enter_context(Film(tmp_path / "film.mp4", 25.0))
+        monkeypatch.setattr(film._writer, "append_data", fail)
+        film.add(np.zeros((120, 160, 3), np.uint8))
+    assert "film.mp4' could not be written to its end" in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 
