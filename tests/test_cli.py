@@ -61,6 +61,7 @@ def test_list_shows_everything(gym_mara: Cli) -> None:
     assert all(environment_id(name) in out for name in environment_names())
     assert "pinocchio" in out
     assert "ur5" in out
+    assert "they make MARA, with 6 joints: a motor makes a joint at each of its two faces" in out
     words = out.split()  # a narrow terminal wraps the lines
     assert all(name in words for name in ALGORITHMS)
     assert all(set(entry.summary.split()) <= set(words) for entry in ALGORITHMS.values())
@@ -213,6 +214,7 @@ def test_an_option_of_rewards_without_effect_is_an_error(
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
         (["train", "--steps", "nan"], "'--steps': must be a whole number"),
+        (["train", "--steps", "1M"], "such as 300000 or 3e5, not '1M'"),
         (["train", "--set", "robot"], "write NAME=VALUE"),
         (["train", "--set", "robot=ur55"], "Did you mean 'ur5'"),
         (
@@ -329,7 +331,7 @@ def _numbers() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("command", "option"), _numbers())
-@pytest.mark.parametrize("value", ["nan", "-inf", "1e300", "9" * 5000, "-1", "1M", "", "0x10"])
+@pytest.mark.parametrize("value", ["nan", "-inf", "1e23", "9" * 5000, "-1", "1M", "", "0x10"])
 def test_every_number_has_a_range(gym_mara: Cli, command: str, option: str, value: str) -> None:
     needed = [] if command in ("train", "benchmark", "search", "watch", "rewards") else ["run"]
     code, _, err = gym_mara(command, *needed, option, value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import resource
 import subprocess
@@ -175,3 +176,16 @@ def test_a_folder_with_a_link_at_any_depth_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a" / "b" / "link").symlink_to("/nowhere")
     with pytest.raises(DamagedFileError, match="symbolic link"):
         refuse_links(tmp_path)
+
+
+def test_no_other_module_reads_or_writes_a_text_file_itself() -> None:
+    found = []
+    for module in sorted((ROOT / "gym_mara").rglob("*.py")):
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or module.name == "files.py":
+                continue
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            by_path = isinstance(node.func, ast.Attribute) and name in ("read_text", "write_text")
+            if by_path or (isinstance(node.func, ast.Name) and name == "open"):
+                found.append(f"{module.name}: {ast.unparse(node)}")
+    assert not found, "use gym_mara.files: whole or not at all, in UTF-8, and bounded"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import pinocchio
 
 from gym_mara.errors import MissingExtraError, unknown
+from gym_mara.files import read_text
 
 
 class RobotFiles(NamedTuple):
@@ -45,7 +46,7 @@ def example_robots_dir() -> Path | None:
 def _example_arms() -> dict[str, dict[str, str | None]]:
     """The fixed-base arms of example-robot-data by name, their files relative to its folder of robots."""
     arms: dict[str, dict[str, str | None]] = json.loads(
-        (_robots_dir() / "example_arms.json").read_text()
+        read_text(_robots_dir() / "example_arms.json")
     )
     return arms
 

@@ -235,6 +235,22 @@ def test_a_worker_that_dies_is_an_error_and_all_end(number: signal.Signals) -> N
     backend.close()
 
 
+def test_sigterm_ends_a_forked_worker_whatever_its_program_does_at_sigterm() -> None:
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        backend = _troubled()
+        victim = backend.processes[0]
+        os.kill(victim.pid or 0, signal.SIGTERM)
+        victim.join()
+        assert victim.exitcode == -signal.SIGTERM, "and prints no traceback"
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    backend.close()
+
+
 def test_a_worker_that_dies_within_a_step_is_noticed() -> None:
     backend = _troubled()
     threading.Timer(0.3, backend.processes[1].kill).start()

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -36,6 +40,12 @@ def test_an_arm_has_as_many_joints_as_its_motors_turn_faces(joints: int) -> None
     robot = RobotModel.load(MODULAR_ARMS[joints])
     assert robot.num_joints == joints
     assert (np.diff(robot.effort_limit) <= 0.0).all()
+
+
+def test_the_page_says_how_many_joints_a_list_of_modules_makes() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "add_a_robot.md"
+    [(modules, joints)] = re.findall(r"--set 'robot=(\[.*\])' +# (\d) joints", page.read_text())
+    assert RobotModel.load(json.loads(modules)).num_joints == int(joints)
 
 
 def test_a_composed_arm_pickles() -> None:

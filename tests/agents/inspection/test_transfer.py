@@ -79,3 +79,9 @@ def test_an_episode_has_the_length_of_the_environment(tmp_path: Path) -> None:
 def test_an_unknown_option_is_an_error(finished_run: RunFolder, name: str) -> None:
     with pytest.raises(GymMaraError, match=f"unknown keyword argument '{name}' on any installed"):
         transfer(finished_run, options={name: 1})
+
+
+@pytest.mark.parametrize("episodes", [0, -1, 1.5, True])
+def test_a_wrong_number_of_episodes_is_an_error(episodes: Any) -> None:
+    with pytest.raises(GymMaraError, match="episodes must be a whole number"):
+        transfer(None, episodes=episodes)  # type: ignore[arg-type]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +20,14 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
 from gym_mara.agents.inspection.watch import film_run, watch_run
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.errors import GymMaraError, MissingExtraError
-from gym_mara.rendering.film import Film
+from gym_mara.rendering.film import Film, labelled
+from tests.agents.conftest import config
 from tests.browser import chromium
 from tests.helpers import robot_model, started
 
@@ -65,7 +70,16 @@ def test_a_film_shows_the_start_of_an_episode(
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_two_backends_are_filmed_side_by_side(
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names: list[str] = []
+
+    def noted(picture: Any, text: str) -> Any:
+        names.append(text)
+        return labelled(picture, text)
+
+    monkeypatch.setattr(watch_module, "labelled", noted)
     film = tmp_path / "film.mp4"
     film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
     shown = pictures(film)
@@ -73,6 +87,7 @@ def test_two_backends_are_filmed_side_by_side(finished_run: RunFolder, tmp_path:
     label, scene = np.s_[:18], np.s_[18:]
     start = shown[0]
     assert differing(start[label, :160], start[label, 160:]) > 0.01, "each side has its name"
+    assert names[:2] == ["pinocchio, at most 1.57 rad/s", "dart"]
     assert differing(start[scene, :160], start[scene, 160:]) < 0.001
     assert differing(shown[-1, scene, :160], shown[-1, scene, 160:]) > 0.0005
 
@@ -167,6 +182,22 @@ def test_a_full_disk_ends_a_film_with_a_clear_error(tmp_path: Path, suffix: str)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_an_encoder_reports_in_many_lines_is_told_in_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(picture: Any) -> None:
+        raise OSError("broken pipe\nffmpeg version\nfailed")
+
+    with ExitStack() as stack:
+        refused = stack.enter_context(pytest.raises(GymMaraError))
+        film = stack.enter_context(Film(tmp_path / "film.mp4", 25.0))
+        monkeypatch.setattr(film._writer, "append_data", fail)
+        film.add(np.zeros((120, 160, 3), np.uint8))
+    assert "film.mp4' could not be written to its end" in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("kind", ["pipe", "folder", "link"])
 def test_a_film_replaces_nothing(tmp_path: Path, kind: str) -> None:
     film = tmp_path / "film.mp4"
@@ -232,6 +263,20 @@ def test_a_report_does_not_overwrite_another_file(finished_run: RunFolder, tmp_p
     assert mine.read_text() == "kept"
     with pytest.raises(GymMaraError, match=r"cannot write.*no folder"):
         write_report(finished_run, tmp_path / "missing" / "report.html")
+
+
+def test_a_full_disk_ends_a_report_with_a_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(run: RunFolder, path: Path, *_: Any, **__: Any) -> None:
+        path.write_text("a half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(report_module, "film_run", full)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(GymMaraError, match=r"cannot write .*No space left"):
+        report_module._video(RunFolder(tmp_path, config()), ["pinocchio"], "last")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

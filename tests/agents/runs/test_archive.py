@@ -68,6 +68,19 @@ def test_anything_but_finite_numbers_is_refused(tmp_path: Path, value: Any) -> N
         read_weights(archive(tmp_path, {"policy.pth": saved(value)}))
 
 
+class Trap:
+    """A failure of the test if it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return pytest.fail, ("it was unpickled",)
+
+
+@pytest.mark.parametrize("value", [Trap(), {"a": Trap()}, {"a": torch.zeros(1), "b": [Trap()]}])
+def test_no_code_runs_in_the_file_of_the_weights(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(DamagedFileError, match="more than weights"):
+        read_weights(archive(tmp_path, {"policy.pth": saved(value)}))
+
+
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_zip_bomb_is_refused_at_once(tmp_path: Path, inside: bool) -> None:
     bomb = archive(tmp_path, {"policy.pth": bytes(4 * LARGEST)}, zipfile.ZIP_DEFLATED)

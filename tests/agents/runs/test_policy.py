@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.wrappers import RescaleAction
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -201,6 +202,15 @@ def test_a_wrong_value_in_a_description_is_an_error(
 ) -> None:
     with pytest.raises(DamagedRunError, match="is damaged"):
         load_policy(changed(finished_run, tmp_path / "run", **changes))
+
+
+def test_an_action_that_is_not_finite_is_an_error(finished_run: RunFolder) -> None:
+    policy = load_policy(finished_run)
+    with torch.no_grad():
+        for weights in policy._network.parameters():
+            weights.fill_(1e38)  # finite, so the file of the weights is read
+    with pytest.raises(DamagedRunError, match=r"action is not finite: its weights are damaged"):
+        policy.predict(np.ones(policy.about.size))
 
 
 def test_a_policy_of_an_older_version_is_refused_in_plain_words(

@@ -92,7 +92,8 @@ def test_no_pickle_of_a_run_is_read_to_resume_it(
 
 def test_a_checkpoint_of_an_older_version_is_refused_in_plain_words(unfinished: RunFolder) -> None:
     folder = unfinished.checkpoints()[-1]
-    (folder / STATE_FILE).rename(folder / "state.pkl")
+    (folder / STATE_FILE).unlink()
+    (folder / "state.pkl").write_bytes(pickle.dumps(_Trap()))
     with pytest.raises(DamagedRunError, match=r"older version.*pickle: train the run again"):
         resume(unfinished.path, silent)
 

@@ -1,0 +1,45 @@
+"""The figures of a report: what they show is within their axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gym_mara.agents.inspection.report_figures import Episode, path
+from gym_mara.agents.inspection.rollout import Trajectory
+from tests.helpers import Floats
+
+STEPS = 40
+PLOTLY_SPREAD = 2.5
+"""Plotly rounds the distance of two ticks up to 1, 2, 5 or 10: at most 2.5 times as far as `nticks` asks for."""
+
+
+def episode(backend: str, tool: Floats) -> Episode:
+    """An episode of one arm whose tool takes this path (T, 3), m."""
+    unused = np.zeros((len(tool), 1))
+    joints = np.zeros((len(tool), 1, 6))
+    played = Trajectory(
+        0.02, joints, joints, joints, tool[:, None], unused, unused, unused, unused > 0.0
+    )
+    return Episode(backend, played)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-4, 0.3, 2.0])
+def test_the_whole_path_and_the_target_are_within_axes_with_ticks(length: float) -> None:
+    along = np.linspace([0.0, 0.0, 0.5], [0.0, length, 0.5], STEPS)
+    across = np.linspace([0.0, 0.0, 0.5], [-0.1 * length, 0.0, 0.5], STEPS)
+    target = np.array([0.2 * length, 0.1 * length, 0.5])
+    scene = path([episode("pinocchio", along), episode("dart", across)], target).layout.scene
+    shown = np.vstack([along, across, target])
+    lengths = []
+    for name, values in zip("xyz", shown.T, strict=True):
+        axis = scene[f"{name}axis"]
+        low, high = axis.range
+        lengths.append(high - low)
+        margin = 0.05 * (high - low)
+        assert low + margin <= values.min()
+        assert values.max() <= high - margin
+        assert axis.nticks / PLOTLY_SPREAD >= 3.0, "at least three ticks"
+    assert scene.aspectmode == "cube"
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-9, err_msg="one scale for all axes")
+    assert 0.01 <= lengths[0] <= max(0.02, 1.5 * length)

@@ -1,0 +1,49 @@
+"""The learning curve of a run as a picture."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.training.learning_curve import plot_learning_curve
+from gym_mara.errors import GymMaraError
+from tests.agents.conftest import config
+
+PROGRESS = (
+    "time/total_timesteps,rollout/reward_per_step,eval/reward_per_step,eval/position_error_mm\n"
+    "512,1.0,,\n1024,2.0,3.0,80.0\n"
+)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A run with a table of progress."""
+    run = RunFolder(tmp_path, config())
+    run.progress_file.write_text(PROGRESS)
+    return run
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """Files of this process may have at most 4,000 bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_learning_curve_is_a_picture(run: RunFolder) -> None:
+    assert plot_learning_curve(run).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_size_limit_leaves_the_old_picture(run: RunFolder, small_files: None) -> None:
+    picture = run.path / "learning_curve.png"
+    picture.write_text("old")
+    with pytest.raises(GymMaraError, match=r"cannot write .*learning_curve.png.*File too large"):
+        plot_learning_curve(run)
+    assert picture.read_text() == "old"
+    assert len(list(run.path.iterdir())) == 2, "and no other file"
