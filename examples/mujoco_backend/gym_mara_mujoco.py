@@ -11,8 +11,8 @@ from gym_mara.backends.servo import Motion, ServoBackend
 from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from gym_mara.robot.kinematics import motion_axis
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact
 from gym_mara.types import Floats
@@ -171,8 +171,8 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
     for number in range(1, robot.model.njoints):
         bodies.append(_add_joint(spec, robot, number, bodies[robot.model.parents[number]]))
     shapes = robot.geometry.geometryObjects
-    for shape in shapes:
-        _add_shape(spec, bodies[shape.parentJoint], robot.model, shape)
+    for geometry, shape in zip(shapes, robot.shapes, strict=True):
+        _add_shape(spec, bodies[geometry.parentJoint], geometry, shape)
     for pair in robot.geometry.collisionPairs:
         spec.add_pair(geomname1=shapes[pair.first].name, geomname2=shapes[pair.second].name)
     try:
@@ -218,10 +218,10 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
     return body
 
 
-def _add_shape(spec: Any, body: Any, model: pin.Model, geometry: pin.GeometryObject) -> None:
-    """Add one of Pinocchio's geometry objects; it collides only in the pairs that `build_model` adds."""
+def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape) -> None:
+    """Add a shape where Pinocchio's geometry object is; it collides only in the pairs that `build_model` adds."""
     kinds, options = mujoco.mjtGeom, dict[str, Any]()
-    match shape_of(model, geometry):
+    match shape:
         case Box(size):
             options = {"type": kinds.mjGEOM_BOX, "size": 0.5 * size}
         case Sphere(radius):
@@ -230,10 +230,10 @@ def _add_shape(spec: Any, body: Any, model: pin.Model, geometry: pin.GeometryObj
             options = {"type": kinds.mjGEOM_CYLINDER, "size": (radius, 0.5 * length, 0.0)}
         case Capsule(radius, length):
             options = {"type": kinds.mjGEOM_CAPSULE, "size": (radius, 0.5 * length, 0.0)}
-        case Mesh(vertices=vertices):
+        case Mesh() as mesh:
             spec.add_mesh(
                 name=geometry.name,
-                uservert=vertices.ravel(),
+                uservert=mesh.vertices.ravel(),
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
             )
             options = {"type": kinds.mjGEOM_MESH, "meshname": geometry.name}

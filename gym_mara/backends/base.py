@@ -25,6 +25,8 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms run faster in several processes: true for an engine that holds Python's lock while it steps."""
+    dynamic: ClassVar[bool] = False
+    """Whether masses and forces count, so that the robot's must be right."""
     most_arms: ClassVar[int] = 2**20
     """The largest number of arms: with more, an ordinary machine runs out of memory."""
     teleports: bool = False
@@ -37,6 +39,8 @@ class Backend(ABC):
     """How long one step lasts, s."""
 
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
+        if self.dynamic:
+            robot.require_dynamics()
         self.robot = robot
         self.num_envs = num_envs
         self.control_period = positive_number(

@@ -61,6 +61,8 @@ class ServoBackend(Backend):
         SimulationDivergedError: from `step`, where an arm's state diverges and `on_divergence` is "error".
     """
 
+    dynamic = True
+
     def __init__(
         self,
         robot: RobotModel,

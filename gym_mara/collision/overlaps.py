@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Shape, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from gym_mara.types import Floats, Mask
 
 _PAIRS = 4
@@ -103,13 +103,14 @@ def _candidates(robot: RobotModel) -> list[_Pair]:
     objects = robot.geometry.geometryObjects
     found = []
     for pair in robot.geometry.collisionPairs:
-        ends = objects[pair.first], objects[pair.second]
-        for moving, fixed in (ends, ends[::-1]):
+        ends = pair.first, pair.second
+        for one, other in (ends, ends[::-1]):
+            moving, fixed = objects[one], objects[other]
             if moving.parentJoint == 0 or fixed.parentJoint != 0:
                 continue
-            box = shape_of(robot.model, fixed)
+            box = robot.shapes[other]
             if isinstance(box, Box):
-                ball = _ball(shape_of(robot.model, moving))
+                ball = _ball(robot.shapes[one])
                 if ball > 0.0:
                     found.append(_pair(moving, ball, fixed, box))
     return sorted(found, key=lambda pair: -pair.body)

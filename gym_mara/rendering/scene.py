@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gym_mara.extras import needs
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from gym_mara.types import Floats
 
 with needs("rendering", "render", "trimesh"):
@@ -69,15 +69,15 @@ class Scene:
     def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
         self._model, self._data = robot.model, robot.model.createData()
-        self._geometry = robot.visual
+        self._geometry, shapes = robot.visual
         self._geometry_data = self._geometry.createData()
         parts: list[Part] = []
         self._geometry_index: list[int] = []
-        for index, shape in enumerate(self._geometry.geometryObjects):
-            link = str(self._model.frames[shape.parentFrame].name)
-            for mesh, colour in _meshes_of(self._model, shape):
-                name = f"{shape.name}/{len(parts)}"
-                parts.append(_part(name, link, mesh, colour, fixed=shape.parentJoint == 0))
+        for index, placed in enumerate(self._geometry.geometryObjects):
+            link = str(self._model.frames[placed.parentFrame].name)
+            for mesh, colour in _meshes_of(placed, shapes[index]):
+                name = f"{placed.name}/{len(parts)}"
+                parts.append(_part(name, link, mesh, colour, fixed=placed.parentJoint == 0))
                 self._geometry_index.append(index)
         self._num_bodies = len(parts)
         parts += _frame("target", 0.14, 0.006) + _frame("tool", 0.09, 0.003)
@@ -109,24 +109,21 @@ class Scene:
         return np.concatenate([part.placed(placement) for part, placement in pairs], dtype=float)
 
 
-def _meshes_of(
-    model: pin.Model, visual: pin.GeometryObject
-) -> list[tuple[trimesh.Trimesh, Colour]]:
-    """The meshes of a URDF visual, in its frame, each with its colour."""
-    red, green, blue, _ = np.asarray(visual.meshColor, float).tolist()
+def _meshes_of(placed: pin.GeometryObject, shape: Shape) -> list[tuple[trimesh.Trimesh, Colour]]:
+    """The meshes of a visual shape, in its frame, each with its colour."""
+    red, green, blue, _ = np.asarray(placed.meshColor, float).tolist()
     own: Colour = (red, green, blue)
-    shape = shape_of(model, visual)
     if not isinstance(shape, Mesh):
         return [(_with_creases(_primitive(shape)), own)]
-    found = []
-    for mesh in trimesh.load_scene(shape.path).dump():
-        if isinstance(mesh, trimesh.Trimesh):
-            mesh.apply_scale(shape.scale)
-            colour = own if visual.overrideMaterial else _colour_of(mesh)
-            # STL stores no vertex normals, so creases are found by angle; the other formats store them.
-            is_stl = shape.path.lower().endswith(".stl")
-            found.append((_with_creases(mesh) if is_stl else mesh, colour))
-    return found
+    # STL stores no vertex normals, so creases are found by angle; the other formats store them.
+    is_stl = shape.path.lower().endswith(".stl")
+    return [
+        (
+            _with_creases(part) if is_stl else part,
+            own if placed.overrideMaterial else _colour_of(part),
+        )
+        for part in shape.parts
+    ]
 
 
 def _primitive(shape: Box | Sphere | Cylinder | Capsule) -> trimesh.Trimesh:

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pinocchio as pin
 
-from gym_mara.robot.srdf import Semantics
+from gym_mara.robot.description.srdf import Semantics
 from gym_mara.types import Floats
 
 

@@ -16,10 +16,14 @@ import pinocchio as pin
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
+from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
+from gym_mara.robot.description.shapes import Shape
+from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
+from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
+from gym_mara.robot.diagnosis import Finding, raise_errors
+from gym_mara.robot.geometry import Geometry, read_geometry
 from gym_mara.robot.kinematics import Kinematics
-from gym_mara.robot.modules import EE_FRAME, MARA, compose
-from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.urdf import build, check_urdf, ee_frame_among_links, make_chain, visual_geometry
+from gym_mara.robot.options import RobotOptions
 from gym_mara.types import Floats
 
 
@@ -55,9 +59,17 @@ class RobotModel:
     """Pinocchio's model, its joints those of `joint_names`."""
     geometry: pin.GeometryModel
     """Pinocchio's collision geometry, with its collision pairs set."""
+    shapes: tuple[Shape, ...]
+    """The collision shapes, those of `geometry.geometryObjects`."""
+    options: RobotOptions
+    """What was added to the files."""
+    findings: tuple[Finding, ...]
+    """What is wrong with the files."""
 
     @classmethod
-    def load(cls, robot: RobotLike | Path, ee_frame: str | None = None) -> RobotModel:
+    def load(
+        cls, robot: RobotLike | Path, ee_frame: str | None = None, **options: Any
+    ) -> RobotModel:
         """Load a robot by its name ("mara", "ur5", …), the path of its URDF, or a list of modules.
 
         A RobotModel is returned as it is.
@@ -65,6 +77,7 @@ class RobotModel:
         Args:
             robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
+            **options: fields of `RobotOptions`.
 
         Raises:
             GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
@@ -73,9 +86,15 @@ class RobotModel:
         if ee_frame is not None and not isinstance(ee_frame, str):
             raise GymMaraError(f"ee_frame must be the name of a link, not {ee_frame!r}")
         if isinstance(robot, RobotModel):
+            if ee_frame is not None or options:
+                given = ", ".join([*(["ee_frame"] if ee_frame is not None else []), *options])
+                raise GymMaraError(
+                    f"{given} cannot change a RobotModel; give it to RobotModel.load, which made the model"
+                )
             return robot
+        own = RobotOptions(**options)
         if isinstance(robot, (list, tuple)):
-            return cls.from_modules(robot)
+            return cls._from_modules(robot, own)
         if not isinstance(robot, (str, Path)):
             raise GymMaraError(
                 f"robot must be a name, the path of a URDF, a list of modules or a RobotModel, not {robot!r}"
@@ -83,9 +102,18 @@ class RobotModel:
         if isinstance(robot, Path) or is_path(robot):
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")
-            return cls.from_urdf(path, ee_frame, srdf if srdf.is_file() else None)
+            srdf_there = srdf if srdf.is_file() else None
+            return cls._from_files(path, ee_frame, srdf_there, None, own, warn=True)
         files = catalog.find(robot)
-        return cls._from_files(files.urdf, ee_frame or files.ee_frame, files.srdf, robot)
+        return cls._from_files(
+            files.urdf,
+            ee_frame or files.ee_frame,
+            files.srdf,
+            robot,
+            own,
+            own_files=False,
+            warn=True,
+        )
 
     @classmethod
     def from_urdf(
@@ -95,10 +123,11 @@ class RobotModel:
         srdf: Path | str | None = None,
         *,
         name: str | None = None,
+        **options: Any,
     ) -> RobotModel:
         """Load an arm from your own files.
 
-        Meshes are looked for beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
+        Meshes are looked for in `package_dirs`, beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
         Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables
         pairs of links.
 
@@ -107,13 +136,17 @@ class RobotModel:
             ee_frame: the end-effector link; by default the one that the SRDF names.
             srdf: path of the SRDF file: disabled collisions, home pose, end effector.
             name: the robot's name; by default the one in the URDF.
+            **options: fields of `RobotOptions`.
 
         Raises:
             GymMaraError: a file is missing or broken, the frame does not exist, or no fixed-base chain leads to it.
 
         Warns if the SRDF names links or joints that the URDF lacks.
         """
-        return cls._from_files(Path(urdf), ee_frame, Path(srdf) if srdf else None, name, warn=True)
+        own = RobotOptions(**options)
+        return cls._from_files(
+            Path(urdf), ee_frame, Path(srdf) if srdf else None, name, own, warn=True
+        )
 
     @classmethod
     def _from_files(
@@ -122,36 +155,52 @@ class RobotModel:
         ee_frame: str | None,
         srdf: Path | None,
         name: str | None,
+        options: RobotOptions,
         *,
+        own_files: bool = True,
         warn: bool = False,
     ) -> RobotModel:
         root = read_xml(urdf, "URDF")
         semantics = read_srdf(srdf) if srdf else Semantics()
-        unknown = semantics.unknown_names(root)
-        if warn and unknown:
-            warnings.warn(
-                f"{str(srdf)!r} names links or joints that {str(urdf)!r} lacks; they are ignored: "
-                f"{', '.join(unknown)}. Correct them, unless the SRDF describes a larger robot",
-                stacklevel=3,
-            )
         ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
-        return cls._from_xml(root, semantics, ee_frame, name, urdf, srdf)
+        findings = []
+        if unknown := semantics.unknown_names(root):
+            findings.append(
+                Finding(
+                    "warning" if own_files else "note",
+                    f"SRDF {str(srdf)!r}",
+                    f"it names links or joints that the URDF lacks: {', '.join(unknown)}",
+                    "they are ignored",
+                    "Correct them, unless the SRDF describes a larger robot",
+                )
+            )
+        robot = cls._from_xml(root, semantics, ee_frame, name, urdf, srdf, options, findings)
+        if warn:
+            robot._warn()
+        return robot
 
     @classmethod
-    def from_modules(cls, modules: Sequence[str]) -> RobotModel:
+    def from_modules(cls, modules: Sequence[str], **options: Any) -> RobotModel:
         """Compose an arm of 3 to 7 joints from MARA's modules, on MARA's table.
 
         Args:
             modules: from "base" to "tool"; between them "motor_large", "motor_medium", "motor_small", "link_straight" and
                 "link_bent", in any number and order in which their faces fit. A motor makes a joint at each of its faces.
+            **options: fields of `RobotOptions`.
 
         Raises:
             GymMaraError: a module is unknown or does not fit, or the arm has too few or too many joints.
         """
+        return cls._from_modules(modules, RobotOptions(**options))
+
+    @classmethod
+    def _from_modules(cls, modules: Sequence[str], options: RobotOptions) -> RobotModel:
         urdf = catalog.find("mara").urdf
         root = compose(urdf, modules)
         name = "mara" if tuple(modules) == MARA else None
-        return cls._from_xml(root, Semantics(), EE_FRAME, name, urdf, None, tuple(modules))
+        return cls._from_xml(
+            root, Semantics(), EE_FRAME, name, urdf, None, options, (), tuple(modules)
+        )
 
     @classmethod
     def _from_xml(
@@ -162,16 +211,25 @@ class RobotModel:
         name: str | None,
         urdf: Path,
         srdf: Path | None,
+        options: RobotOptions,
+        of_files: Sequence[Finding],
         modules: tuple[str, ...] = (),
     ) -> RobotModel:
-        check_urdf(urdf, root)
+        check_urdf(urdf, root, options.package_dirs)
         chain = make_chain(urdf, root, ee_frame)
         xml = ElementTree.tostring(root, encoding="unicode")
-        model, geometry = build(urdf, xml)
+        model = build(urdf, xml)
+        hulls = options.convex_hulls
+        geometry, shapes = read_geometry(
+            urdf, xml, model, "collision", options.package_dirs, convex_hulls=hulls
+        )
         limits = model.lowerPositionLimit, model.upperPositionLimit
         home = np.clip(semantics.home(chain), *limits)
+        name = name or root.get("name") or urdf.stem
+        findings = tuple(of_files)
+        raise_errors(name, findings, dynamics=False)
         return cls(
-            name=name or root.get("name") or urdf.stem,
+            name=name,
             urdf=urdf,
             srdf=srdf,
             modules=modules,
@@ -180,12 +238,15 @@ class RobotModel:
             joint_names=tuple(model.names)[1:],
             lower=_read_only(model.lowerPositionLimit),
             upper=_read_only(model.upperPositionLimit),
-            velocity_limit=_read_only(model.velocityLimit),
-            effort_limit=_read_only(model.effortLimit),
+            velocity_limit=_read_only(options.limits("velocity_limit", chain, model.velocityLimit)),
+            effort_limit=_read_only(options.limits("effort_limit", chain, model.effortLimit)),
             home=_read_only(home),
             collision_pairs=set_collision_pairs(root, semantics, model, geometry, home),
             model=model,
             geometry=geometry,
+            shapes=shapes,
+            options=options,
+            findings=findings,
         )
 
     @property
@@ -200,9 +261,24 @@ class RobotModel:
         return int(self.model.getFrameId(self.ee_frame, pin.FrameType.BODY))
 
     @cached_property
-    def visual(self) -> pin.GeometryModel:
-        """Pinocchio's visual geometry, read on first use."""
-        return visual_geometry(self.urdf, self.xml, self.model)
+    def visual(self) -> Geometry:
+        """The visual shapes, read on first use; the collision shapes if the URDF has no others."""
+        visual = read_geometry(self.urdf, self.xml, self.model, "visual", self.options.package_dirs)
+        return visual if visual.shapes else Geometry(self.geometry, self.shapes)
+
+    def _warn(self) -> None:
+        """Warn of what is probably not meant."""
+        for finding in self.findings:
+            if finding.severity == "warning":
+                warnings.warn(f"{str(self.urdf)!r}: {finding}", stacklevel=4)
+
+    def require_dynamics(self) -> None:
+        """Check that backends with dynamics can simulate this arm.
+
+        Raises:
+            GymMaraError: they cannot; it says why, and what to do.
+        """
+        raise_errors(self.name, self.findings, dynamics=True)
 
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""
@@ -273,8 +349,14 @@ class RobotModel:
     def __reduce__(self) -> tuple[Any, ...]:
         # Pinocchio's geometry does not pickle; a copy is loaded from the modules or the files.
         if self.modules:
-            return RobotModel.from_modules, (self.modules,)
-        return RobotModel._from_files, (self.urdf, self.ee_frame, self.srdf, self.name)
+            return RobotModel._from_modules, (self.modules, self.options)
+        return RobotModel._from_files, (
+            self.urdf,
+            self.ee_frame,
+            self.srdf,
+            self.name,
+            self.options,
+        )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
         return self  # immutable

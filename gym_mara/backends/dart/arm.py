@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -14,13 +16,14 @@ from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Sphere
 from gym_mara.robot.kinematics import motion_axis
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
 with needs("the backend 'dart'", "dart"):
     import dartpy as dart
+    import trimesh
 
 GRAVITY = 9.81
 """m/s², downwards."""
@@ -285,7 +288,7 @@ def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
 
 def _shape(robot: RobotModel, index: int) -> Any:
     """DART's shape of one of the robot's collision shapes."""
-    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
+    match robot.shapes[index]:
         case Box(size):
             return dart.dynamics.BoxShape(size)
         case Sphere(radius):
@@ -294,21 +297,20 @@ def _shape(robot: RobotModel, index: int) -> Any:
             return dart.dynamics.CylinderShape(radius, length)
         case Capsule(radius, length):
             return dart.dynamics.CapsuleShape(radius, length)
-        case Mesh(path, scale, convex=False):
-            return _mesh(path, scale)
-    raise GymMaraError(
-        f"the backend 'dart' does not support the convex hull of link {robot.link_of(index)!r}"
-    )
+        case Mesh() as mesh:
+            return _mesh(mesh)
 
 
-def _mesh(path: str, scale: Floats) -> Any:
-    """A mesh from a file; DART reads meshes only as parts of a URDF."""
-    sizes = " ".join(repr(float(value)) for value in scale)
-    urdf = (
-        f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(path)} '
-        f'scale="{sizes}"/></geometry></collision></link></robot>'
-    )
-    skeleton = dart.utils.DartLoader().parseSkeletonString(urdf, "")
+def _mesh(mesh: Mesh) -> Any:
+    """DART's form of a mesh. DART reads meshes only from files, and only as parts of a URDF."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.stl"
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+        urdf = (
+            f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(str(path))}/>'
+            "</geometry></collision></link></robot>"
+        )
+        skeleton = dart.utils.DartLoader().parseSkeletonString(urdf, "")
     if skeleton is None:
-        raise GymMaraError(f"DART cannot read the mesh {path!r}")
+        raise GymMaraError(f"DART cannot read the mesh {mesh.path!r}")
     return skeleton.getBodyNode(0).getShapeNode(0).getShape()

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import plain_size
+from gym_mara.robot.description.mesh_files import candidates
 
 # More than any robot has; the number of pairs of shapes grows with the square.
 _MOST = {"link": 1000, "joint": 1000, "collision": 500}
@@ -47,7 +47,7 @@ _COUNT = {"xyz": 3, "rpy": 3, "size": 3, "scale": 3}
 """How many numbers an attribute has; the others have one."""
 
 
-def check_urdf(urdf: Path, root: ElementTree.Element) -> None:
+def check_urdf(urdf: Path, root: ElementTree.Element, package_dirs: Sequence[str] = ()) -> None:
     """Check a URDF before Pinocchio reads it: how much it holds, its numbers, and its mesh files.
 
     Raises:
@@ -71,8 +71,8 @@ def check_urdf(urdf: Path, root: ElementTree.Element) -> None:
                             f"{_COUNT.get(name, 1)} finite number(s) from {least:g} to {_LARGEST_NUMBER:g} are allowed"
                         )
     names = {mesh.get("filename", "") for mesh in root.iter("mesh")} - {""}
-    files = (file for name in names for file in _mesh_files(urdf, name))
-    if sum(map(plain_size, files)) > _LARGEST_MESHES:
+    places = (place for name in names for place in candidates(urdf, name, package_dirs))
+    if sum(plain_size(place) for place in places if os.path.lexists(place)) > _LARGEST_MESHES:
         raise GymMaraError(
             f"the meshes of {str(urdf)!r} are larger than {_LARGEST_MESHES:,} bytes together"
         )
@@ -87,13 +87,6 @@ def _is_number(text: str, name: str, least: float) -> bool:
     return len(numbers) == _COUNT.get(name, 1) and all(
         least <= number <= _LARGEST_NUMBER for number in numbers
     )
-
-
-def _mesh_files(urdf: Path, name: str) -> list[Path]:
-    """The existing files that the name of a mesh may mean."""
-    rest = name.split("://", 1)[-1]
-    places = [Path(folder) / rest for folder in _package_folders(urdf)]
-    return [place for place in {Path(rest), *places} if os.path.lexists(place)]
 
 
 def ee_frame_among_links(urdf: Path, root: ElementTree.Element, ee_frame: str | None) -> str:
@@ -188,50 +181,19 @@ def _make_revolute(joint: ElementTree.Element) -> None:
     limit.set("upper", repr(np.pi))
 
 
-def build(urdf: Path, text: str) -> tuple[pin.Model, pin.GeometryModel]:
-    """Pinocchio's model and collision geometry of a URDF, given as text.
+def build(urdf: Path, text: str) -> pin.Model:
+    """Pinocchio's model of a URDF, given as text.
 
     Raises:
-        GymMaraError: Pinocchio cannot load it, or a mesh is not found.
+        GymMaraError: Pinocchio cannot load it.
     """
-    with _named_in_errors(urdf):
-        model = pin.buildModelFromXML(text)
-        return model, _geometry(urdf, model, text, pin.GeometryType.COLLISION)
-
-
-def visual_geometry(urdf: Path, text: str, model: pin.Model) -> pin.GeometryModel:
-    """The visual geometry of a model's links; their collision geometry if the URDF has no visual geometry.
-
-    Raises:
-        GymMaraError: a mesh is not found.
-    """
-    with _named_in_errors(urdf):
-        geometry = _geometry(urdf, model, text, pin.GeometryType.VISUAL)
-        if geometry.ngeoms == 0:
-            geometry = _geometry(urdf, model, text, pin.GeometryType.COLLISION)
-        return geometry
-
-
-def _geometry(urdf: Path, model: pin.Model, text: str, kind: pin.GeometryType) -> pin.GeometryModel:
-    folders = _package_folders(urdf)
-    geometry = pin.buildGeomFromUrdfString(model, text, kind, package_dirs=folders)
-    for geometry_object in geometry.geometryObjects:
-        shape = geometry_object.geometry
-        if isinstance(shape, coal.BVHModelBase) and not np.isfinite(shape.vertices()).all():
-            raise GymMaraError(
-                f"the mesh {geometry_object.meshPath!r} has a vertex that is not finite"
-            )
-    return geometry
-
-
-def _package_folders(urdf: Path) -> list[str]:
-    """Where meshes are: they are often named package://…, and the package may be any folder above the URDF."""
-    ros_path = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if folder]
-    return [str(parent) for parent in urdf.absolute().parents] + ros_path
+    with named_in_errors(urdf):
+        return pin.buildModelFromXML(text)
 
 
 @contextmanager
-def _named_in_errors(urdf: Path) -> Iterator[None]:
+def named_in_errors(urdf: Path) -> Iterator[None]:
+    """Raise Pinocchio's errors as GymMaraError, with the name of the file."""
     try:
         yield
     except GymMaraError:

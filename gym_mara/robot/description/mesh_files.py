@@ -1,0 +1,53 @@
+"""Where the mesh files of a URDF are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gym_mara.errors import GymMaraError
+
+_SHOWN = 6
+"""The number of places that an error names."""
+
+
+def mesh_file(urdf: Path, name: str, package_dirs: Sequence[str]) -> Path:
+    """The file that a mesh's name means: an absolute path, file://…, package://… or a path beside the URDF.
+
+    The package of package://PACKAGE/PATH is a folder of that name in `package_dirs`, in a folder above the URDF, or along
+    ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; or `package_dirs` has the folder itself.
+
+    Raises:
+        GymMaraError: there is no such file.
+    """
+    places = candidates(urdf, name, package_dirs)
+    for place in places:
+        if os.path.lexists(place):
+            return place
+    shown = [str(place) for place in places[:_SHOWN]]
+    rest = f" and {len(places) - _SHOWN} more places" if len(places) > _SHOWN else ""
+    raise GymMaraError(
+        f"the mesh {name!r} of {str(urdf)!r} is not found; it was looked for at {', '.join(shown)}{rest}. "
+        "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"
+    )
+
+
+def candidates(urdf: Path, name: str, package_dirs: Sequence[str]) -> list[Path]:
+    """The places where a mesh may be, the first one first."""
+    scheme, _, rest = name.rpartition("://")
+    own = urdf.absolute().parent
+    if scheme == "file" or (not scheme and Path(rest).is_absolute()):
+        return [Path(rest)]
+    given = [Path(folder).absolute() for folder in package_dirs]
+    ros = [
+        Path(folder) / below
+        for variable, below in (("ROS_PACKAGE_PATH", ""), ("AMENT_PREFIX_PATH", "share"))
+        for folder in os.environ.get(variable, "").split(os.pathsep)
+        if folder
+    ]
+    _, _, inside = rest.partition("/")
+    # package_dirs may name the package's own folder, whatever its name is.
+    renamed = [folder / inside for folder in given] if scheme else []
+    folders = [*given, own, *own.parents, *ros]
+    return list(dict.fromkeys([*(folder / rest for folder in folders), *renamed]))

@@ -1,0 +1,83 @@
+"""What a user adds to a robot's files: where packages are, and values that the URDF lacks or has wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gym_mara.errors import GymMaraError, flag, positive_number, unknown
+from gym_mara.types import Floats
+
+PerJoint = float | Sequence[float] | Mapping[str, float]
+"""A number for every joint, one for each joint of the chain, or numbers by the names of joints."""
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """How a robot's files are read, and what replaces their values. Each value is a keyword argument of the environments.
+
+    Raises:
+        GymMaraError: a value has the wrong form or is out of its range.
+    """
+
+    package_dirs: Sequence[str] = ()
+    """Folders in which the packages of package://… are looked for first."""
+    default_mass: float | None = None
+    """The mass of each moving body that has none, kg; its inertia is that of its shapes. None leaves it without mass."""
+    effort_limit: PerJoint | None = None
+    """Nm (N for a prismatic joint), in place of the URDF's; None for those."""
+    velocity_limit: PerJoint | None = None
+    """rad/s (m/s), in place of the URDF's; None for those."""
+    convex_hulls: bool = False
+    """Whether the convex hull of each collision mesh takes its place: faster, but it fills hollows."""
+
+    def __post_init__(self) -> None:
+        folders = self.package_dirs
+        if isinstance(folders, str) or not all(isinstance(folder, str) for folder in folders):
+            raise GymMaraError(f"package_dirs must be a list of folders, not {folders!r}")
+        object.__setattr__(self, "package_dirs", tuple(folders))
+        if self.default_mass is not None:
+            mass = positive_number("default_mass", self.default_mass, "kg", at_least=1e-6)
+            object.__setattr__(self, "default_mass", mass)
+        object.__setattr__(self, "convex_hulls", flag("convex_hulls", self.convex_hulls))
+
+    def limits(self, name: str, joints: Sequence[str], of_urdf: Floats) -> Floats:
+        """The limits (J,) that `effort_limit` or `velocity_limit` gives, else those of the URDF.
+
+        Args:
+            name: "effort_limit" or "velocity_limit".
+            joints: the names of the joints of the chain.
+            of_urdf: the limits in the URDF (J,).
+
+        Raises:
+            GymMaraError: a value is not positive, a name is no joint of the chain, or there are too few or too many.
+        """
+        given: Any = getattr(self, name)
+        limits = np.array(of_urdf, dtype=np.float64)
+        if given is None:
+            return limits
+        if isinstance(given, Mapping):
+            for joint, value in given.items():
+                if joint not in joints:
+                    raise unknown("joint", joint, joints, f" in {name}")
+                limits[joints.index(joint)] = positive_number(f"{name}[{joint!r}]", value)
+            return limits
+        if isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, str):
+            if np.ndim(given) and len(given) != len(joints):
+                raise GymMaraError(
+                    f"{name} has {len(given)} values; the arm has {len(joints)} joints: {', '.join(joints)}"
+                )
+            if np.ndim(given):
+                return np.array([positive_number(name, value) for value in given])
+        limits[:] = positive_number(name, given)
+        return limits
+
+
+def text_keywords(options: RobotOptions) -> str:
+    """The options that differ from the defaults, for messages."""
+    defaults = RobotOptions()
+    changed = (n for n in vars(options) if getattr(options, n) != getattr(defaults, n))
+    return ", ".join(f"{name}={getattr(options, name)!r}" for name in changed)
