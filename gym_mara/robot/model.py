@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,15 +12,13 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers
-from gym_mara.robot import catalog
-from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
-from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
+from gym_mara.robot import bounds, catalog
+from gym_mara.robot.collision_pairs import Pair, link_of
 from gym_mara.robot.description.shapes import Shape
-from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
-from gym_mara.robot.diagnosis import Finding, raise_errors
+from gym_mara.robot.diagnosis import NO_VELOCITY, Finding, raise_errors, warn
 from gym_mara.robot.geometry import Geometry, read_geometry
 from gym_mara.robot.kinematics import Kinematics
+from gym_mara.robot.loading import from_files, from_modules, read_only, with_notes
 from gym_mara.robot.options import RobotOptions
 from gym_mara.types import Floats
 
@@ -53,8 +49,10 @@ class RobotModel:
     """Nm (N)."""
     home: Floats
     """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
-    collision_pairs: frozenset[frozenset[str]]
+    collision_pairs: frozenset[Pair]
     """The pairs of links that may collide."""
+    excluded_pairs: Mapping[Pair, str]
+    """The other pairs of links on different bodies, and why they are never checked."""
     model: pin.Model
     """Pinocchio's model, its joints those of `joint_names`."""
     geometry: pin.GeometryModel
@@ -72,7 +70,7 @@ class RobotModel:
     ) -> RobotModel:
         """Load a robot by its name ("mara", "ur5", …), the path of its URDF, or a list of modules.
 
-        A RobotModel is returned as it is.
+        A RobotModel is returned as it is. Warns of what is probably not meant, see `findings`.
 
         Args:
             robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
@@ -80,7 +78,20 @@ class RobotModel:
             **options: fields of `RobotOptions`.
 
         Raises:
-            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
+            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm that can move.
+            MissingExtraError: the robot's files come with a package that is not installed.
+        """
+        loaded = cls.inspect(robot, ee_frame, **options)
+        return loaded if loaded is robot else loaded._checked()
+
+    @classmethod
+    def inspect(
+        cls, robot: RobotLike | Path, ee_frame: str | None = None, **options: Any
+    ) -> RobotModel:
+        """Load a robot as `load` does, but neither raise nor warn by its findings.
+
+        Raises:
+            GymMaraError: the robot cannot be read at all.
             MissingExtraError: the robot's files come with a package that is not installed.
         """
         if ee_frame is not None and not isinstance(ee_frame, str):
@@ -94,7 +105,7 @@ class RobotModel:
             return robot
         own = RobotOptions(**options)
         if isinstance(robot, (list, tuple)):
-            return cls._from_modules(robot, own)
+            return from_modules(cls, robot, own)
         if not isinstance(robot, (str, Path)):
             raise GymMaraError(
                 f"robot must be a name, the path of a URDF, a list of modules or a RobotModel, not {robot!r}"
@@ -103,17 +114,11 @@ class RobotModel:
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")
             srdf_there = srdf if srdf.is_file() else None
-            return cls._from_files(path, ee_frame, srdf_there, None, own, warn=True)
+            return from_files(cls, path, ee_frame, srdf_there, None, own)
         files = catalog.find(robot)
-        return cls._from_files(
-            files.urdf,
-            ee_frame or files.ee_frame,
-            files.srdf,
-            robot,
-            own,
-            own_files=False,
-            warn=True,
-        )
+        frame = ee_frame or files.ee_frame
+        found = from_files(cls, files.urdf, frame, files.srdf, robot, own)
+        return with_notes(found)
 
     @classmethod
     def from_urdf(
@@ -141,43 +146,11 @@ class RobotModel:
         Raises:
             GymMaraError: a file is missing or broken, the frame does not exist, or no fixed-base chain leads to it.
 
-        Warns if the SRDF names links or joints that the URDF lacks.
+        Warns of what is probably not meant, see `findings`.
         """
         own = RobotOptions(**options)
-        return cls._from_files(
-            Path(urdf), ee_frame, Path(srdf) if srdf else None, name, own, warn=True
-        )
-
-    @classmethod
-    def _from_files(
-        cls,
-        urdf: Path,
-        ee_frame: str | None,
-        srdf: Path | None,
-        name: str | None,
-        options: RobotOptions,
-        *,
-        own_files: bool = True,
-        warn: bool = False,
-    ) -> RobotModel:
-        root = read_xml(urdf, "URDF")
-        semantics = read_srdf(srdf) if srdf else Semantics()
-        ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
-        findings = []
-        if unknown := semantics.unknown_names(root):
-            findings.append(
-                Finding(
-                    "warning" if own_files else "note",
-                    f"SRDF {str(srdf)!r}",
-                    f"it names links or joints that the URDF lacks: {', '.join(unknown)}",
-                    "they are ignored",
-                    "Correct them, unless the SRDF describes a larger robot",
-                )
-            )
-        robot = cls._from_xml(root, semantics, ee_frame, name, urdf, srdf, options, findings)
-        if warn:
-            robot._warn()
-        return robot
+        found = from_files(cls, Path(urdf), ee_frame, Path(srdf) if srdf else None, name, own)
+        return found._checked()
 
     @classmethod
     def from_modules(cls, modules: Sequence[str], **options: Any) -> RobotModel:
@@ -191,63 +164,13 @@ class RobotModel:
         Raises:
             GymMaraError: a module is unknown or does not fit, or the arm has too few or too many joints.
         """
-        return cls._from_modules(modules, RobotOptions(**options))
+        return from_modules(cls, modules, RobotOptions(**options))
 
-    @classmethod
-    def _from_modules(cls, modules: Sequence[str], options: RobotOptions) -> RobotModel:
-        urdf = catalog.find("mara").urdf
-        root = compose(urdf, modules)
-        name = "mara" if tuple(modules) == MARA else None
-        return cls._from_xml(
-            root, Semantics(), EE_FRAME, name, urdf, None, options, (), tuple(modules)
-        )
-
-    @classmethod
-    def _from_xml(
-        cls,
-        root: ElementTree.Element,
-        semantics: Semantics,
-        ee_frame: str,
-        name: str | None,
-        urdf: Path,
-        srdf: Path | None,
-        options: RobotOptions,
-        of_files: Sequence[Finding],
-        modules: tuple[str, ...] = (),
-    ) -> RobotModel:
-        check_urdf(urdf, root, options.package_dirs)
-        chain = make_chain(urdf, root, ee_frame)
-        xml = ElementTree.tostring(root, encoding="unicode")
-        model = build(urdf, xml)
-        hulls = options.convex_hulls
-        geometry, shapes = read_geometry(
-            urdf, xml, model, "collision", options.package_dirs, convex_hulls=hulls
-        )
-        limits = model.lowerPositionLimit, model.upperPositionLimit
-        home = np.clip(semantics.home(chain), *limits)
-        name = name or root.get("name") or urdf.stem
-        findings = tuple(of_files)
-        raise_errors(name, findings, dynamics=False)
-        return cls(
-            name=name,
-            urdf=urdf,
-            srdf=srdf,
-            modules=modules,
-            xml=xml,
-            ee_frame=ee_frame,
-            joint_names=tuple(model.names)[1:],
-            lower=_read_only(model.lowerPositionLimit),
-            upper=_read_only(model.upperPositionLimit),
-            velocity_limit=_read_only(options.limits("velocity_limit", chain, model.velocityLimit)),
-            effort_limit=_read_only(options.limits("effort_limit", chain, model.effortLimit)),
-            home=_read_only(home),
-            collision_pairs=set_collision_pairs(root, semantics, model, geometry, home),
-            model=model,
-            geometry=geometry,
-            shapes=shapes,
-            options=options,
-            findings=findings,
-        )
+    def _checked(self) -> RobotModel:
+        """This robot; raises and warns by its findings, in the name of the caller of the calling method."""
+        raise_errors(self.name, self.findings, dynamics=False)
+        warn(repr(str(self.urdf)), self.findings, stacklevel=3)
+        return self
 
     @property
     def num_joints(self) -> int:
@@ -266,12 +189,6 @@ class RobotModel:
         visual = read_geometry(self.urdf, self.xml, self.model, "visual", self.options.package_dirs)
         return visual if visual.shapes else Geometry(self.geometry, self.shapes)
 
-    def _warn(self) -> None:
-        """Warn of what is probably not meant."""
-        for finding in self.findings:
-            if finding.severity == "warning":
-                warnings.warn(f"{str(self.urdf)!r}: {finding}", stacklevel=4)
-
     def require_dynamics(self) -> None:
         """Check that backends with dynamics can simulate this arm.
 
@@ -280,6 +197,19 @@ class RobotModel:
         """
         raise_errors(self.name, self.findings, dynamics=True)
 
+    def require_velocity(self) -> None:
+        """Check that no joint has the velocity limit 0.
+
+        Raises:
+            GymMaraError: one has; it says what to do.
+        """
+        for finding in self.findings:
+            if finding.message == NO_VELOCITY:
+                raise GymMaraError(
+                    f"{self.name} cannot move with max_joint_velocity: {finding.part}: {finding.message}. "
+                    f"{finding.remedy}, or leave out max_joint_velocity: then joints teleport"
+                )
+
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""
         return Kinematics(self.model, self.ee_frame_id)
@@ -287,36 +217,12 @@ class RobotModel:
     @cached_property
     def reach(self) -> Floats:
         """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or 1 if prismatic."""
-        reach = np.zeros(self.num_joints)
-        for body, point in self._points():
-            for joint in range(body):
-                reach[joint] = max(reach[joint], self._lengths[joint + 1 : body].sum() + point)
-        reach[self.kinematics().prismatic] = 1.0
-        return _read_only(reach)
+        return read_only(bounds.reach(self))
 
     @cached_property
     def extent(self) -> float:
         """A bound on how far any point of the arm can be from the world's origin, m."""
-        return max(float(self._lengths[:body].sum() + point) for body, point in self._points())
-
-    @cached_property
-    def _lengths(self) -> Floats:
-        """A bound (J,) on how far each joint's origin is from that of the joint before, m; the first from the world's."""
-        slides = self.kinematics().prismatic
-        span = np.where(slides, np.maximum(abs(self.lower), abs(self.upper)), 0.0)
-        return span + [np.linalg.norm(p.translation) for p in self.model.jointPlacements[1:]]
-
-    def _points(self) -> list[tuple[int, float]]:
-        """Bounds on how far the arm's points are from the joint that carries them: joint number, m."""
-        frame = self.model.frames[self.ee_frame_id]
-        points = [(int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)))]
-        for geometry_object in self.geometry.geometryObjects:
-            shape, body = geometry_object.geometry, geometry_object.parentJoint
-            if body > 0:
-                shape.computeLocalAABB()
-                centre = geometry_object.placement.act(shape.aabb_center)
-                points.append((body, float(np.linalg.norm(centre) + shape.aabb_radius)))
-        return points
+        return bounds.extent(self)
 
     def link_of(self, geometry_index: int) -> str:
         """The name of the link that a collision shape belongs to, given the shape's index."""
@@ -349,14 +255,9 @@ class RobotModel:
     def __reduce__(self) -> tuple[Any, ...]:
         # Pinocchio's geometry does not pickle; a copy is loaded from the modules or the files.
         if self.modules:
-            return RobotModel._from_modules, (self.modules, self.options)
-        return RobotModel._from_files, (
-            self.urdf,
-            self.ee_frame,
-            self.srdf,
-            self.name,
-            self.options,
-        )
+            return from_modules, (RobotModel, self.modules, self.options, self.findings)
+        files = self.urdf, self.ee_frame, self.srdf, self.name
+        return from_files, (RobotModel, *files, self.options, self.findings)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
         return self  # immutable
@@ -372,9 +273,3 @@ def is_path(robot: object) -> TypeGuard[str | Path]:
 
 RobotLike = str | Sequence[str] | RobotModel
 """A robot's name, the path of its URDF, a list of modules, or a loaded robot."""
-
-
-def _read_only(values: Floats) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array

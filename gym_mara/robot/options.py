@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, flag, positive_number, unknown
 from gym_mara.types import Floats
@@ -44,36 +45,49 @@ class RobotOptions:
             object.__setattr__(self, "default_mass", mass)
         object.__setattr__(self, "convex_hulls", flag("convex_hulls", self.convex_hulls))
 
-    def limits(self, name: str, joints: Sequence[str], of_urdf: Floats) -> Floats:
-        """The limits (J,) that `effort_limit` or `velocity_limit` gives, else those of the URDF.
+        for name in ("effort_limit", "velocity_limit"):
+            object.__setattr__(self, name, _per_joint(name, getattr(self, name)))
 
-        Args:
-            name: "effort_limit" or "velocity_limit".
-            joints: the names of the joints of the chain.
-            of_urdf: the limits in the URDF (J,).
+    def apply_limits(self, model: pin.Model) -> None:
+        """Put `effort_limit` and `velocity_limit` in place of those of Pinocchio's model of the chain.
 
         Raises:
-            GymMaraError: a value is not positive, a name is no joint of the chain, or there are too few or too many.
+            GymMaraError: a name is no joint of the chain, or there are too few or too many values.
         """
-        given: Any = getattr(self, name)
-        limits = np.array(of_urdf, dtype=np.float64)
-        if given is None:
-            return limits
-        if isinstance(given, Mapping):
+        joints = list(model.names)[1:]
+        if self.effort_limit is not None:
+            model.effortLimit = self._limits("effort_limit", joints, model.effortLimit)
+        if self.velocity_limit is not None:
+            model.velocityLimit = self._limits("velocity_limit", joints, model.velocityLimit)
+
+    def _limits(self, name: str, joints: Sequence[str], of_urdf: Floats) -> Floats:
+        """The limits (J,) of these joints that `effort_limit` or `velocity_limit` gives, else those of the URDF."""
+        given, limits = getattr(self, name), np.array(of_urdf, dtype=np.float64)
+        if isinstance(given, dict):
             for joint, value in given.items():
                 if joint not in joints:
                     raise unknown("joint", joint, joints, f" in {name}")
-                limits[joints.index(joint)] = positive_number(f"{name}[{joint!r}]", value)
-            return limits
-        if isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, str):
-            if np.ndim(given) and len(given) != len(joints):
-                raise GymMaraError(
-                    f"{name} has {len(given)} values; the arm has {len(joints)} joints: {', '.join(joints)}"
-                )
-            if np.ndim(given):
-                return np.array([positive_number(name, value) for value in given])
-        limits[:] = positive_number(name, given)
+                limits[joints.index(joint)] = value
+        elif isinstance(given, tuple) and len(given) != len(joints):
+            raise GymMaraError(
+                f"{name} has {len(given)} values; the arm has {len(joints)} joints: {', '.join(joints)}"
+            )
+        else:
+            limits[:] = given
         return limits
+
+
+def _per_joint(name: str, given: Any) -> PerJoint | None:
+    """A number, a tuple of numbers or a dictionary of numbers, checked to be positive.
+
+    Raises:
+        GymMaraError: it is neither, or a number is not positive.
+    """
+    if isinstance(given, Mapping):
+        return {joint: positive_number(f"{name}[{joint!r}]", v) for joint, v in given.items()}
+    if isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, str) and np.ndim(given):
+        return tuple(positive_number(name, value) for value in given)
+    return None if given is None else positive_number(name, given)
 
 
 def text_keywords(options: RobotOptions) -> str:

@@ -1,12 +1,16 @@
-"""What is wrong with a robot's description, found when it is loaded: each finding says what follows and what to do."""
+"""Finding: something in a robot's description that a user should know, and what to do."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from gym_mara.errors import GymMaraError
+
+_SHOWN = 10
+"""The number of names that a finding lists."""
 
 
 @dataclass(frozen=True)
@@ -43,3 +47,27 @@ def raise_errors(name: str, findings: Iterable[Finding], *, dynamics: bool) -> N
             f"the robot {name!r} cannot be simulated{' with dynamics' if dynamics else ''}:\n"
             + "\n".join(f"- {finding}" for finding in errors)
         )
+
+
+def warn(source: str, findings: Iterable[Finding], *, stacklevel: int) -> None:
+    """Warn once of each warning among findings.
+
+    Args:
+        source: the file that they are about.
+        findings: the findings.
+        stacklevel: 1 for the caller of this function, 2 for its caller, and so on.
+    """
+    for finding in findings:
+        if finding.severity == "warning":
+            warnings.warn(f"{source}: {finding}", stacklevel=stacklevel + 1)
+
+
+def listed(names: Sequence[str]) -> str:
+    """The names for a message: at most ten of them, and how many more there are."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def parts(kind: str, names: Sequence[str]) -> str:
+    """What a finding is about: "joint j1", "joints j1, j2"."""
+    return f"{kind}{'s' if len(names) > 1 else ''} {listed(names)}"
