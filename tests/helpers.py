@@ -1,4 +1,4 @@
-"""Helpers of the tests: cached robots, configurations, golden values, small URDFs, processes."""
+"""Helpers of the tests: cached robots, configurations, golden values, small URDFs, processes, the command."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from gym_mara import cli
 from gym_mara.robot import RobotModel
 
 Floats = NDArray[np.float64]
@@ -119,3 +121,19 @@ def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+
+
+class Cli:
+    """Runs the command in this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+
+    def __call__(self, *arguments: object) -> tuple[int, str, str]:
+        """The exit code, the output and the error output."""
+        self._monkeypatch.setattr(sys, "argv", ["gym-mara", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            cli.main()
+        printed = self._capsys.readouterr()
+        code = exit_.value.code
+        return code if isinstance(code, int) else int(bool(code)), printed.out, printed.err
