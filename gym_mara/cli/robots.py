@@ -79,7 +79,8 @@ def robot(
 ) -> None:
     """Check the files of an arm: findings, joints, collision pairs, reach, and the backends on which it works.
 
-    The exit code is 1 if the files are broken, or if the arm does not work on the backend, or on any.
+    The exit code is 1 if the files are broken, or if the arm does not work on the backend, or on any. Needs the extra render
+    for --picture.
     """
     options = RobotOptions(**_robot_options(settings))
     names = installed_backends()[0] if backend is None else [backend]
@@ -181,7 +182,7 @@ def _draw(arm: RobotModel, target: dict[str, Any], file: Path) -> None:
 
 
 def _print(found: dict[str, Any]) -> None:
-    table = Table("", "part", "what is wrong", "effect", "remedy", title="Findings")
+    table = _table("Findings", "", "part", "what is wrong", "effect", "remedy")
     for finding in found["findings"]:
         where = "with dynamics: " if finding["dynamics"] else ""
         table.add_row(
@@ -210,8 +211,7 @@ def _print(found: dict[str, Any]) -> None:
 
 def _joints(joints: list[dict[str, Any]]) -> Table:
     names = "joint", "type", "limits", "velocity", "effort", "axis", "moves", "kg"
-    columns = (Column(name, overflow="fold") for name in names)
-    table = Table(*columns, title="Joints, in rad and Nm (prismatic: m and N)")
+    table = _table("Joints, in rad and Nm (prismatic: m and N)", *names)
     for joint in joints:
         table.add_row(
             joint["name"],
@@ -224,3 +224,8 @@ def _joints(joints: list[dict[str, Any]]) -> Table:
             f"{joint['mass']:.4g}",
         )
     return table
+
+
+def _table(title: str, *columns: str) -> Table:
+    """An empty table that breaks long names, and cuts nothing off."""
+    return Table(*(Column(name, overflow="fold") for name in columns), title=title)

@@ -66,11 +66,12 @@ def _touching(robot: RobotModel) -> Iterator[Finding]:
             _remedy(robot),
         )
     if often := often_touching(robot):
-        lowest, highest = (100 * of(often.values()) for of in (min, max))
+        lowest, highest = (f"{100 * of(often.values()):.0f} %" for of in (min, max))
+        span = lowest if lowest == highest else f"{lowest} to {highest}"
         yield Finding(
             "warning",
             f"links {pair_names(sorted(often, key=lambda pair: -often[pair]))}",
-            f"they touch in {lowest:.0f} % to {highest:.0f} % of random poses",
+            f"they touch in {span} of random poses",
             "most poses of the arm count as collisions",
             _remedy(robot),
         )
