@@ -59,7 +59,6 @@ class PinocchioBackend(Backend):
         self.max_joint_velocity = None
         self.teleports = max_joint_velocity is None
         if max_joint_velocity is not None:
-            robot.require_velocity()
             velocity = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
             self.max_joint_velocity = velocity
             self.joint_velocity = np.full(robot.num_joints, velocity)

@@ -100,7 +100,7 @@ def _build(
     geometry, shapes = read_geometry(
         urdf, xml, model, "collision", options.package_dirs, convex_hulls=options.convex_hulls
     )
-    options.apply_limits(model)
+    options.apply_limits(model, chain)
     if options.default_mass is not None:
         add_inertias(model, geometry, shapes, options.default_mass)
     home = np.clip(semantics.home(chain), model.lowerPositionLimit, model.upperPositionLimit)

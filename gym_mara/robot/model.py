@@ -15,7 +15,7 @@ from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import bounds, catalog
 from gym_mara.robot.collision_pairs import Pair, link_of
 from gym_mara.robot.description.shapes import Shape
-from gym_mara.robot.diagnosis import NO_VELOCITY, Finding, raise_errors, warn
+from gym_mara.robot.diagnosis import Finding, raise_errors, warn
 from gym_mara.robot.geometry import Geometry, read_geometry
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.robot.loading import from_files, from_modules, read_only, with_notes
@@ -196,19 +196,6 @@ class RobotModel:
             GymMaraError: they cannot; it says why, and what to do.
         """
         raise_errors(self.name, self.findings, dynamics=True)
-
-    def require_velocity(self) -> None:
-        """Check that no joint has the velocity limit 0.
-
-        Raises:
-            GymMaraError: one has; it says what to do.
-        """
-        for finding in self.findings:
-            if finding.message == NO_VELOCITY:
-                raise GymMaraError(
-                    f"{self.name} cannot move with max_joint_velocity: {finding.part}: {finding.message}. "
-                    f"{finding.remedy}, or leave out max_joint_velocity: then joints teleport"
-                )
 
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""

@@ -48,13 +48,16 @@ class RobotOptions:
         for name in ("effort_limit", "velocity_limit"):
             object.__setattr__(self, name, _per_joint(name, getattr(self, name)))
 
-    def apply_limits(self, model: pin.Model) -> None:
-        """Put `effort_limit` and `velocity_limit` in place of those of Pinocchio's model of the chain.
+    def apply_limits(self, model: pin.Model, joints: Sequence[str]) -> None:
+        """Put `effort_limit` and `velocity_limit` in place of those of Pinocchio's model.
+
+        Args:
+            model: the model.
+            joints: the names of the joints of the chain.
 
         Raises:
             GymMaraError: a name is no joint of the chain, or there are too few or too many values.
         """
-        joints = list(model.names)[1:]
         if self.effort_limit is not None:
             model.effortLimit = self._limits("effort_limit", joints, model.effortLimit)
         if self.velocity_limit is not None:

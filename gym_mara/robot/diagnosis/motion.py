@@ -16,7 +16,7 @@ from gym_mara.types import Floats
 if TYPE_CHECKING:
     from gym_mara.robot.model import RobotModel
 
-NARROWEST = 1e-6
+_NARROWEST = 1e-6
 """A joint with a smaller range cannot move, rad (m)."""
 _HEAVIEST = 1e4
 """A heavier body is taken for an error, kg."""
@@ -24,7 +24,6 @@ _FARTHEST = 1.0
 """A centre of mass may be this far from its link, and twice the link's size, m."""
 _ROUNDING = 0.01
 """Moments of inertia may violate the triangle inequality by this share, as rounded ones do."""
-NO_VELOCITY = "velocity limit 0"
 
 
 def motion_findings(robot: RobotModel) -> list[Finding]:
@@ -32,16 +31,16 @@ def motion_findings(robot: RobotModel) -> list[Finding]:
     return [*_joints(robot), *_missing_inertias(robot), *_odd_inertias(robot)]
 
 
-def frozen(robot: RobotModel) -> Floats:
+def _frozen(robot: RobotModel) -> Floats:
     """Which joints (J,) cannot move, because their limits are equal."""
-    return np.asarray(robot.upper - robot.lower < NARROWEST)
+    return np.asarray(robot.upper - robot.lower < _NARROWEST)
 
 
 def _joints(robot: RobotModel) -> Iterator[Finding]:
     def named(which: Floats) -> list[str]:
         return [robot.joint_names[joint] for joint in np.flatnonzero(which)]
 
-    if still := named(frozen(robot)):
+    if still := named(_frozen(robot)):
         every = len(still) == robot.num_joints
         yield Finding(
             "error" if every else "warning",
@@ -57,7 +56,7 @@ def _joints(robot: RobotModel) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 parts("joint", zero),
-                NO_VELOCITY if word == "velocity" else "effort limit 0",
+                f"{word} limit 0",
                 "a joint without velocity stands still"
                 if word == "velocity"
                 else "a motor without force holds nothing",
@@ -125,7 +124,7 @@ def _odd_inertias(robot: RobotModel) -> Iterator[Finding]:
         ),
         (
             lambda number, own: bool(
-                np.linalg.norm(own.lever) > max(_FARTHEST, 2.0 * sizes[number - 1])
+                np.linalg.norm(own.lever) > max(_FARTHEST, 2.0 * sizes[number])
             ),
             "its centre of mass is far outside of it",
             "its motion is wrong",
@@ -149,14 +148,19 @@ def _odd_inertias(robot: RobotModel) -> Iterator[Finding]:
 
 
 def _sizes(robot: RobotModel) -> Floats:
-    """How far the farthest point of each body is from its joint (J,), m; the next joint counts as a point."""
-    sizes = np.zeros(robot.num_joints)
-    for number, placement in enumerate(robot.model.jointPlacements[2:]):
-        sizes[number] = np.linalg.norm(placement.translation)
+    """How far the farthest point of each body is from its joint, m, by Pinocchio's index; the next joint counts as a point."""
+    model = robot.model
+    sizes = np.zeros(model.njoints)
+
+    def reaches(body: int, distance: float) -> None:
+        sizes[body] = max(sizes[body], distance)
+
+    for number in range(2, model.njoints):
+        reaches(
+            model.parents[number], float(np.linalg.norm(model.jointPlacements[number].translation))
+        )
     for each in robot.geometry.geometryObjects:
-        if each.parentJoint:
-            each.geometry.computeLocalAABB()
-            centre = each.placement.act(each.geometry.aabb_center)
-            far = float(np.linalg.norm(centre) + each.geometry.aabb_radius)
-            sizes[each.parentJoint - 1] = max(sizes[each.parentJoint - 1], far)
+        each.geometry.computeLocalAABB()
+        centre = each.placement.act(each.geometry.aabb_center)
+        reaches(each.parentJoint, float(np.linalg.norm(centre) + each.geometry.aabb_radius))
     return sizes

@@ -59,14 +59,6 @@ def test_the_mass_of_a_link_that_is_fixed_to_the_moving_one_counts(tmp_path: Pat
     assert RobotModel.load(arm_file(tmp_path, text), TOOL).findings == ()
 
 
-def test_a_joint_that_cannot_turn_has_no_limited_velocity_either(tmp_path: Path) -> None:
-    robot = RobotModel.load(arm_file(tmp_path, FAULTS["velocity 0"][0]), TOOL)
-    with pytest.raises(GymMaraError, match="max_joint_velocity: joints j1, j2, j3: velocity limit"):
-        make_backend("pinocchio", robot, 1, {"max_joint_velocity": 1.0})
-    given = RobotModel.load(robot.urdf, TOOL, velocity_limit={"j1": 1.0, "j2": 1.0, "j3": 1.0})
-    make_backend("pinocchio", given, 1, {"max_joint_velocity": 1.0})
-
-
 def test_an_arm_that_cannot_move_is_refused(tmp_path: Path) -> None:
     text = arm(limit='<limit effort="50" velocity="2"/>')
     with pytest.raises(GymMaraError, match=r"joints j1, j2, j3: the lower limit equals the upper"):
