@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.backends.base import Backend
+from gym_mara.backends.base import Backend, limited_velocity
 from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
@@ -86,8 +86,7 @@ class ServoBackend(Backend):
         self.physics_step = positive_number("physics_step", physics_step, "s")
         self._times = step_times(self.control_period, self.physics_step)[:, None, None]
         if max_joint_velocity is not None:
-            limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
-            self.joint_velocity = np.minimum(limit, robot.velocity_limit)
+            self.joint_velocity = limited_velocity(robot, max_joint_velocity)
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
         self._kinematics = robot.kinematics()
