@@ -33,6 +33,8 @@ class Backend(ABC):
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False
     """Whether parameters are drawn for each episode; if so `begin_episodes` is called before its reset."""
+    overshoot: float = 0.0
+    """How far joints may be beyond their limits, rad (m): with dynamics, end stops give way a little."""
     joint_velocity: Floats
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float

@@ -44,7 +44,8 @@ class ServoBackend(Backend):
     """Full dynamics: gravity, inertia, contact, and motors with limits of velocity and effort.
 
     Each joint has a position servo: its motor is commanded the velocity clip(gain · (target - q), ± the limit of velocity)
-    at every physics step, and exerts what torque that takes, up to the effort limit. A subclass adds the engine: it
+    at every physics step, and exerts what torque that takes, up to the effort limit. Joints have end stops at their limits.
+    The state has the engine's joint positions, and its velocities clipped to the limits. A subclass adds the engine: it
     implements `_run`, `_put_at_rest` and `_rebuild`, and calls `reset` at the end of its constructor.
 
     Args:
@@ -62,6 +63,7 @@ class ServoBackend(Backend):
     """
 
     dynamic = True
+    overshoot = 0.01
 
     def __init__(
         self,
@@ -148,8 +150,7 @@ class ServoBackend(Backend):
 
     @property
     def state(self) -> SimState:
-        # Engines let joints slip past their limits by a little.
-        q = self._q.clip(self.robot.lower, self.robot.upper)
+        q = self._q.copy()
         qd = self._qd.clip(-self.joint_velocity, self.joint_velocity)
         position, quaternion = self._kinematics.pose(q)
         parameters = {name: values.copy() for name, values in self._parameters.items()}
