@@ -19,6 +19,7 @@ from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.description.shapes import Shape
 from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
+from gym_mara.robot.description.target import Target, read_target
 from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
 from gym_mara.robot.diagnosis import Finding, raise_errors
 from gym_mara.robot.geometry import Geometry, read_geometry
@@ -55,6 +56,8 @@ class RobotModel:
     """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
     collision_pairs: frozenset[frozenset[str]]
     """The pairs of links that may collide."""
+    target: Target | None
+    """The default target, from the file NAME.target.json beside NAME.urdf; None if there is no such file."""
     model: pin.Model
     """Pinocchio's model, its joints those of `joint_names`."""
     geometry: pin.GeometryModel
@@ -75,7 +78,8 @@ class RobotModel:
         A RobotModel is returned as it is.
 
         Args:
-            robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
+            robot: the robot. A path ends in ".urdf" or ".xml"; NAME.srdf and NAME.target.json beside NAME.urdf are read
+                too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
             **options: fields of `RobotOptions`.
 
@@ -174,7 +178,10 @@ class RobotModel:
                     "Correct them, unless the SRDF describes a larger robot",
                 )
             )
-        robot = cls._from_xml(root, semantics, ee_frame, name, urdf, srdf, options, findings)
+        target = read_target(urdf)
+        robot = cls._from_xml(
+            root, semantics, ee_frame, name, urdf, srdf, target, options, findings
+        )
         if warn:
             robot._warn()
         return robot
@@ -197,9 +204,9 @@ class RobotModel:
     def _from_modules(cls, modules: Sequence[str], options: RobotOptions) -> RobotModel:
         urdf = catalog.find("mara").urdf
         root = compose(urdf, modules)
-        name = "mara" if tuple(modules) == MARA else None
+        name, target = ("mara", read_target(urdf)) if tuple(modules) == MARA else (None, None)
         return cls._from_xml(
-            root, Semantics(), EE_FRAME, name, urdf, None, options, (), tuple(modules)
+            root, Semantics(), EE_FRAME, name, urdf, None, target, options, (), tuple(modules)
         )
 
     @classmethod
@@ -211,6 +218,7 @@ class RobotModel:
         name: str | None,
         urdf: Path,
         srdf: Path | None,
+        target: Target | None,
         options: RobotOptions,
         of_files: Sequence[Finding],
         modules: tuple[str, ...] = (),
@@ -242,6 +250,7 @@ class RobotModel:
             effort_limit=_read_only(options.limits("effort_limit", chain, model.effortLimit)),
             home=_read_only(home),
             collision_pairs=set_collision_pairs(root, semantics, model, geometry, home),
+            target=target,
             model=model,
             geometry=geometry,
             shapes=shapes,
