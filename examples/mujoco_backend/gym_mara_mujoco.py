@@ -207,6 +207,9 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
         axis=angular if angular.any() else linear,
         limited=True,
         range=(robot.lower[number - 1], robot.upper[number - 1]),
+        # An end stop as hard as MuJoCo allows with this physics step.
+        solref_limit=(2.0 * spec.option.timestep, 1.0),
+        solimp_limit=(_HARD, _HARD, 1.0, 0.5, 1.0),
         frictionloss=robot.model.friction[number - 1],
     )
     motor = spec.add_tendon(

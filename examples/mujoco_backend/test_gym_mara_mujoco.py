@@ -120,6 +120,25 @@ def test_motors_and_joints_stay_within_their_limits(robot: RobotModel) -> None:
     assert (np.max(efforts, axis=(0, 1)) <= robot.effort_limit).all()
 
 
+def test_a_weak_arm_falls_onto_its_end_stop(tmp_path: Path) -> None:
+    path = tmp_path / "weak.urdf"
+    path.write_text(
+        SLIDER.replace('lower="-2" upper="2" effort="1"', 'lower="1" upper="2" effort="0.1"')
+    )
+    robot = RobotModel.from_urdf(path, ee_frame="pole")
+    backend = MujocoBackend(robot, 1)
+    backend.reset(np.array([[0.0, 1.8]]))
+    positions = []
+    for _ in range(100):
+        state = backend.step(np.array([[0.0, 1.8]]))
+        assert state.torque is not None
+        assert (np.abs(state.torque) <= robot.effort_limit).all()
+        np.testing.assert_array_equal(state.q[0], backend._arms[0].qpos)
+        positions.append(state.q[0, 1])
+    assert min(positions) >= 1.0 - backend.overshoot
+    np.testing.assert_allclose(positions[-10:], 1.0, atol=1e-3)
+
+
 def test_a_joint_moves_at_max_joint_velocity(mara: RobotModel) -> None:
     backend = MujocoBackend(mara, 1, max_joint_velocity=0.5)
     np.testing.assert_array_equal(backend.joint_velocity, 0.5)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.errors import positive_number
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.types import Floats, Mask
@@ -33,6 +33,8 @@ class Backend(ABC):
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False
     """Whether parameters are drawn for each episode; if so `begin_episodes` is called before its reset."""
+    overshoot: float = 0.0
+    """How far joints may be beyond their limits, rad (m): with dynamics, end stops give way a little."""
     joint_velocity: Floats
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float
@@ -93,3 +95,19 @@ class Backend(ABC):
 
     def close(self) -> None:  # noqa: B027 - most have nothing to free
         """Free the engine; no other method is called afterwards."""
+
+
+def limited_velocity(robot: RobotModel, max_joint_velocity: float) -> Floats:
+    """The highest velocity of each joint (J,), rad/s (m/s): `max_joint_velocity`, or the robot's limit where that is lower.
+
+    Raises:
+        GymMaraError: it is no positive number, or the robot's limit of a joint is zero.
+    """
+    limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
+    if not (robot.velocity_limit > 0.0).all():
+        joint = robot.joint_names[int((robot.velocity_limit > 0.0).argmin())]
+        raise GymMaraError(
+            f"joint {joint} of {robot.name} cannot move with max_joint_velocity, because its velocity limit is 0: correct the "
+            f"URDF, or give velocity_limit={{{joint!r}: …}}, rad/s (m/s)"
+        )
+    return np.minimum(limit, robot.velocity_limit)

@@ -14,6 +14,7 @@ import pinocchio as pin
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.robot import RobotModel
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from gym_mara.robot.joint_ranges import action_range
 from gym_mara.types import Floats, Mask
 
 _PAIRS = 4
@@ -78,8 +79,8 @@ class Overlaps:
         """The pairs that together find the most collisions of random actions, each the best of those left."""
         if not candidates:
             return []
-        joints = self._robot.num_joints
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, joints))
+        low, high = action_range(self._robot)
+        q = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
         q = q.clip(self._robot.lower, self._robot.upper)
         missed = CoalChecker(self._robot).check(q)
         enough = _WORTHWHILE * np.count_nonzero(missed)

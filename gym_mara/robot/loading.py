@@ -15,6 +15,7 @@ from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import set_collision_pairs
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
+from gym_mara.robot.description.target import Target, read_target
 from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
 from gym_mara.robot.diagnosis import (
     Finding,
@@ -59,7 +60,8 @@ def from_files(
     root = read_xml(urdf, "URDF")
     semantics = read_srdf(srdf) if srdf else Semantics()
     ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
-    robot = _build(cls, root, semantics, ee_frame, name, urdf, srdf, (), options)
+    target = read_target(urdf)
+    robot = _build(cls, root, semantics, ee_frame, name, urdf, srdf, (), target, options)
     of_srdf = semantics_findings(srdf, semantics, root) if srdf else []
     return _with_findings(robot, findings, of_srdf)
 
@@ -76,8 +78,11 @@ def from_modules(
         GymMaraError: a module is unknown or does not fit, or the arm has too few or too many joints.
     """
     urdf = catalog.find("mara").urdf
-    root, name = compose(urdf, modules), "mara" if tuple(modules) == MARA else None
-    robot = _build(cls, root, Semantics(), EE_FRAME, name, urdf, None, tuple(modules), options)
+    root = compose(urdf, modules)
+    name, target = ("mara", read_target(urdf)) if tuple(modules) == MARA else (None, None)
+    robot = _build(
+        cls, root, Semantics(), EE_FRAME, name, urdf, None, tuple(modules), target, options
+    )
     return with_notes(_with_findings(robot, findings))
 
 
@@ -90,6 +95,7 @@ def _build(
     urdf: Path,
     srdf: Path | None,
     modules: tuple[str, ...],
+    target: Target | None,
     options: RobotOptions,
 ) -> RobotModel:
     """The arm of a URDF that has been read, without findings."""
@@ -120,6 +126,7 @@ def _build(
         home=read_only(home),
         collision_pairs=pairs.checked,
         excluded_pairs=MappingProxyType(pairs.excluded),
+        target=target,
         model=model,
         geometry=geometry,
         shapes=shapes,

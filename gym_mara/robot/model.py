@@ -15,6 +15,7 @@ from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import bounds, catalog
 from gym_mara.robot.collision_pairs import Pair, link_of
 from gym_mara.robot.description.shapes import Shape
+from gym_mara.robot.description.target import Target
 from gym_mara.robot.diagnosis import Finding, raise_errors, warn
 from gym_mara.robot.geometry import Geometry, read_geometry
 from gym_mara.robot.kinematics import Kinematics
@@ -53,6 +54,8 @@ class RobotModel:
     """The pairs of links that may collide."""
     excluded_pairs: Mapping[Pair, str]
     """The other pairs of links on different bodies, and why they are never checked."""
+    target: Target | None
+    """The default target, from the file NAME.target.json beside NAME.urdf; None if there is no such file."""
     model: pin.Model
     """Pinocchio's model, its joints those of `joint_names`."""
     geometry: pin.GeometryModel
@@ -73,7 +76,8 @@ class RobotModel:
         A RobotModel is returned as it is. Warns of what is probably not meant, see `findings`.
 
         Args:
-            robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
+            robot: the robot. A path ends in ".urdf" or ".xml"; NAME.srdf and NAME.target.json beside NAME.urdf are read
+                too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
             **options: fields of `RobotOptions`.
 

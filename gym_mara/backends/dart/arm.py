@@ -37,6 +37,8 @@ LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
 # DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
 _NO_MASS = 1e-9
+_REACHED = 1e-6
+"""A joint this close to its commanded velocity, rad/s (m/s), has reached it; DART is accurate to 1e-8."""
 
 
 class DartArm:
@@ -48,7 +50,7 @@ class DartArm:
         detector: the collision detector, one of DETECTORS; None for a world without collisions.
         velocity_limit: of the joints (J,), rad/s; None for the robot's.
         like: an arm of the same robot and settings, with which it shares what has no state.
-        servo: whether motors move the joints; without them the arm falls.
+        servo: whether motors move the joints, up to end stops at their limits; without both the arm falls freely.
 
     Raises:
         GymMaraError: the detector is unknown, or DART does not know a shape of the robot.
@@ -71,8 +73,11 @@ class DartArm:
         self._joints = [body.getParentJoint() for body in self.bodies[1:]]
         speed = robot.velocity_limit if velocity_limit is None else velocity_limit
         if servo:
-            for joint in self._joints:
+            for joint, low, high in zip(self._joints, robot.lower, robot.upper, strict=True):
                 joint.setActuatorType(dart.dynamics.SERVO)
+                joint.setPositionLowerLimit(0, low)
+                joint.setPositionUpperLimit(0, high)
+                joint.setLimitEnforcement(True)
             self.set_parameters()
         if detector is not None:
             self._build_shapes()
@@ -86,6 +91,7 @@ class DartArm:
             world.getConstraintSolver().getCollisionGroup().setAutomaticUpdate(False)
         self._free_world.getConstraintSolver().getCollisionGroup().removeAllShapeFrames()
         self._block = max(1, round(LOOK_AHEAD / physics_step))
+        self._commanded = np.zeros(robot.num_joints)
         self._speed, self._fastest = speed, 1.05 * speed
         within_block = 1.25 * speed * self._block * physics_step
         self._clearance: CollisionChecker = NoChecker(robot)
@@ -163,7 +169,7 @@ class DartArm:
         """
         model, count = self.robot.model, self.robot.num_joints
         friction = model.friction if joint_friction is None else joint_friction
-        effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
+        self._effort = effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
         mass, friction = np.broadcast_to(mass, count), np.broadcast_to(friction, count)
         for index, (joint, body) in enumerate(zip(self._joints, self.bodies[1:], strict=True)):
             joint.setForceLowerLimit(0, -effort[index])
@@ -201,7 +207,10 @@ class DartArm:
     @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
-        return np.asarray(self.skeleton.getConstraintForces())
+        # DART adds what end stops and contacts exert. A motor that does not reach its commanded velocity exerts all it can.
+        effort, missing = self._effort, self._commanded - self.qd
+        forces = np.clip(self.skeleton.getConstraintForces(), -effort, effort)
+        return np.where(np.abs(missing) > _REACHED, np.copysign(effort, missing), forces)
 
     def run(self, velocities: Floats) -> tuple[Contact, ...]:
         """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts in any of them.
@@ -211,6 +220,7 @@ class DartArm:
         motor is too weak to hold the arm.
         """
         deepest: dict[tuple[str, str], float] = {}
+        self._commanded = velocities[-1]
         for start in range(0, len(velocities), self._block):
             block = velocities[start : start + self._block]
             if self.may_touch():
