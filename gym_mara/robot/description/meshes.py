@@ -34,10 +34,10 @@ def read_mesh(path: Path, scale: tuple[float, float, float], *, convex: bool) ->
 def _scaled(
     path: Path, version: tuple[int, int], scale: tuple[float, float, float], convex: bool
 ) -> Mesh:
-    parts = [part.copy().apply_scale(scale) for part in _parts(path, version)]
     if convex:
-        parts = [trimesh.util.concatenate(parts).convex_hull]
-    return Mesh(str(path), tuple(parts), convex)
+        return _scaled(path, version, scale, convex=False).hull
+    parts = [part.copy().apply_scale(scale) for part in _parts(path, version)]
+    return Mesh(str(path), tuple(parts))
 
 
 @lru_cache(maxsize=_KEPT)

@@ -73,5 +73,19 @@ class Mesh:
         faces = [part.faces + start for part, start in zip(self.parts, starts, strict=True)]
         return np.concatenate(faces).astype(np.int64)
 
+    @cached_property
+    def hull(self) -> Mesh:
+        """The convex hull of all parts; the mesh itself where it is one, or is flat and encloses no volume."""
+        import trimesh  # few robots here have meshes
+        from scipy.spatial import QhullError
+
+        if self.convex:
+            return self
+        try:
+            hull = trimesh.convex.convex_hull(self.vertices)
+        except QhullError:
+            return self
+        return Mesh(self.path, (hull,), convex=True)
+
 
 Shape = Box | Sphere | Cylinder | Capsule | Mesh
