@@ -76,16 +76,15 @@ class Mesh:
     @cached_property
     def hull(self) -> Mesh:
         """The convex hull of all parts; the mesh itself where it is one, or is flat and encloses no volume."""
+        if self.convex or self._is_flat():
+            return self
         import trimesh  # few robots here have meshes
-        from scipy.spatial import QhullError
 
-        if self.convex:
-            return self
-        try:
-            hull = trimesh.convex.convex_hull(self.vertices)
-        except QhullError:
-            return self
-        return Mesh(self.path, (hull,), convex=True)
+        return Mesh(self.path, (trimesh.convex.convex_hull(self.vertices),), convex=True)
+
+    def _is_flat(self) -> bool:
+        lengths = np.linalg.svd(self.vertices - self.vertices.mean(axis=0), compute_uv=False)
+        return bool(lengths[-1] <= 1e-9 * lengths[0])
 
 
 Shape = Box | Sphere | Cylinder | Capsule | Mesh
