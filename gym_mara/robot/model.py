@@ -16,6 +16,7 @@ import pinocchio as pin
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
+from gym_mara.robot.description.empty_shapes import drop_empty_shapes
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.description.shapes import Shape
 from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
@@ -216,6 +217,7 @@ class RobotModel:
         modules: tuple[str, ...] = (),
     ) -> RobotModel:
         check_urdf(urdf, root, options.package_dirs)
+        empty = drop_empty_shapes(root)
         chain = make_chain(urdf, root, ee_frame)
         xml = ElementTree.tostring(root, encoding="unicode")
         model = build(urdf, xml)
@@ -226,7 +228,7 @@ class RobotModel:
         limits = model.lowerPositionLimit, model.upperPositionLimit
         home = np.clip(semantics.home(chain), *limits)
         name = name or root.get("name") or urdf.stem
-        findings = tuple(of_files)
+        findings = (*of_files, *empty)
         raise_errors(name, findings, dynamics=False)
         return cls(
             name=name,
