@@ -9,6 +9,8 @@ import pinocchio as pin
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.robot import RobotModel
+from gym_mara.robot.description.shapes import Mesh
+from gym_mara.robot.geometry import coal_mesh
 from gym_mara.types import Floats, Mask
 
 
@@ -27,13 +29,14 @@ class CoalChecker(CollisionChecker):
         super().__init__(robot)
         self._displacement = displacement
         # The manager holds references to its arguments without keeping them alive.
-        self._data, self._geometry_data = robot.model.createData(), robot.geometry.createData()
+        self._geometry = robot.geometry if displacement is None else _with_hulls(robot)
+        self._data, self._geometry_data = robot.model.createData(), self._geometry.createData()
         if displacement is not None:
             margins = approach_bounds(robot, displacement).tolist()
             for request, margin in zip(self._geometry_data.collisionRequests, margins, strict=True):
                 request.security_margin = margin
         self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
-            robot.model, robot.geometry, self._geometry_data
+            robot.model, self._geometry, self._geometry_data
         )
 
     def check(self, q: Floats) -> Mask:
@@ -50,6 +53,20 @@ class CoalChecker(CollisionChecker):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.robot, self._displacement)
+
+
+def _with_hulls(robot: RobotModel) -> pin.GeometryModel:
+    """The robot's collision geometry with the convex hull of each mesh in its place.
+
+    Two hulls are never further apart than their meshes, and Coal finds their distance up to a thousand times faster.
+    """
+    if not any(isinstance(shape, Mesh) for shape in robot.shapes):
+        return robot.geometry
+    geometry = robot.geometry.copy()
+    for placed, shape in zip(geometry.geometryObjects, robot.shapes, strict=True):
+        if isinstance(shape, Mesh):
+            placed.geometry = coal_mesh(shape.hull)
+    return geometry
 
 
 def approach_bounds(robot: RobotModel, displacement: Floats) -> Floats:

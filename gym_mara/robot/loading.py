@@ -13,6 +13,7 @@ import numpy as np
 
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import set_collision_pairs
+from gym_mara.robot.description.empty_shapes import drop_empty_shapes
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
 from gym_mara.robot.description.target import Target, read_target
@@ -100,6 +101,7 @@ def _build(
 ) -> RobotModel:
     """The arm of a URDF that has been read, without findings."""
     check_urdf(urdf, root, options.package_dirs)
+    empty = drop_empty_shapes(root)
     chain = make_chain(urdf, root, ee_frame)
     xml = ElementTree.tostring(root, encoding="unicode")
     model = build(urdf, xml)
@@ -131,7 +133,7 @@ def _build(
         geometry=geometry,
         shapes=shapes,
         options=options,
-        findings=(),
+        findings=tuple(empty),
     )
 
 
@@ -140,7 +142,7 @@ def _with_findings(
 ) -> RobotModel:
     """The arm with these findings, or else with those of its files and its own."""
     if findings is None:
-        findings = [*of_files, *motion_findings(robot), *collision_findings(robot)]
+        findings = [*of_files, *robot.findings, *motion_findings(robot), *collision_findings(robot)]
     return replace(robot, findings=tuple(findings))
 
 

@@ -9,8 +9,9 @@ import pinocchio as pin
 import pytest
 
 from gym_mara.backends import make_backend
-from gym_mara.backends.dart.arm import DETECTORS, DartArm
+from gym_mara.backends.dart.arm import DartArm
 from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.dart.shapes import DETECTORS
 from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.collision import make_checker
 from gym_mara.collision.coal import approach_bounds

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from gym_mara.collision import make_checker
@@ -18,6 +20,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, COPIES, uniform_q
 from tests.helpers import PATH_ENDS, TARGET_Q, Floats, robot_model
+from tests.shape_pairs import held
 
 ENGINES = ("coal", "coal in threads", "fcl")
 CONTACT = 1e-4
@@ -183,3 +186,18 @@ def test_an_engine_refuses_threads_that_it_does_not_support(
         GymMaraError, match=f"(at least 1|1 unless collision='coal').* not {threads}"
     ):
         make_checker(engine, mara, threads)
+
+
+def test_with_a_margin_no_collision_of_meshes_nearby_is_missed(tmp_path: Path) -> None:
+    """The margin is checked on the meshes' hulls, which is quick, and reports a little more."""
+    trimesh.creation.torus(0.2, 0.05).export(tmp_path / "torus.stl")
+    torus = f'<mesh filename="{tmp_path}/torus.stl"/>'
+    robot = held(tmp_path, torus, torus)
+    coal, step = make_checker("coal", robot), np.full(6, 0.02)
+    near = coal.with_margin(step)
+    assert near is not None
+    q = uniform_q(robot, 200, 0)
+    moved = q + np.random.default_rng(0).uniform(-step, step, q.shape)
+    free = ~near.check(q)
+    assert free.any()
+    assert not (free & coal.check(moved)).any()

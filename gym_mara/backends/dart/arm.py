@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
 
+from gym_mara.backends.dart.shapes import Detector
 from gym_mara.backends.servo import has_diverged
 from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
-from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
-from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Sphere
 from gym_mara.robot.kinematics import motion_axis
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
 with needs("the backend 'dart'", "dart"):
     import dartpy as dart
-    import trimesh
 
 GRAVITY = 9.81
 """m/s², downwards."""
-DETECTORS = {
-    "fcl": "FCLCollisionDetector",
-    "dart": "DARTCollisionDetector",
-    "bullet": "BulletCollisionDetector",
-    "ode": "OdeCollisionDetector",
-}
 LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
 # DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
@@ -47,7 +36,7 @@ class DartArm:
     Args:
         robot: the arm.
         physics_step: s.
-        detector: the collision detector, one of DETECTORS; None for a world without collisions.
+        detector: the collision detector, one of `DETECTORS`; None for a world without collisions.
         velocity_limit: of the joints (J,), rad/s; None for the robot's.
         like: an arm of the same robot and settings, with which it shares what has no state.
         servo: whether motors move the joints, up to end stops at their limits; without both the arm falls freely.
@@ -79,13 +68,15 @@ class DartArm:
                 joint.setPositionUpperLimit(0, high)
                 joint.setLimitEnforcement(True)
             self.set_parameters()
+        self._detector: Detector | None = None
         if detector is not None:
-            self._build_shapes()
-        self.world = _world(physics_step, detector or "fcl")
+            self._detector = like._detector if like else Detector(detector, robot)
+        self._build_shapes()
+        self.world = self._new_world()
         self.world.addSkeleton(self.skeleton)
         self._forbid_contacts()
         # The same arm in a world without collision detection, which is most of what a step costs.
-        self._free_world = _world(physics_step, detector or "fcl")
+        self._free_world = self._new_world()
         self._free_world.addSkeleton(self.skeleton)
         for world in (self.world, self._free_world):
             world.getConstraintSolver().getCollisionGroup().setAutomaticUpdate(False)
@@ -95,7 +86,7 @@ class DartArm:
         self._speed, self._fastest = speed, 1.05 * speed
         within_block = 1.25 * speed * self._block * physics_step
         self._clearance: CollisionChecker = NoChecker(robot)
-        if detector is not None:
+        if self._detector is not None:
             self._clearance = like._clearance if like else CoalChecker(robot, within_block)
 
     def _build_bodies(self) -> list[Any]:
@@ -123,6 +114,8 @@ class DartArm:
 
     def _build_shapes(self) -> None:
         """The shapes of each link, on a body with the name of the link."""
+        if self._detector is None:
+            return
         links: dict[str, Any] = {}
         unnamed = dict(enumerate(self.bodies))
         for index, geometry_object in enumerate(self.robot.geometry.geometryObjects):
@@ -135,10 +128,11 @@ class DartArm:
                     _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
                 body.setName(link)
                 links[link] = body
-            node = links[link].createShapeNode(_shape(self.robot, index))
-            node.createCollisionAspect()
-            node.createDynamicsAspect()
-            node.setRelativeTransform(_isometry(geometry_object.placement))
+            for shape, placement in self._detector.shapes[index]:
+                node = links[link].createShapeNode(shape)
+                node.createCollisionAspect()
+                node.createDynamicsAspect()
+                node.setRelativeTransform(_isometry(geometry_object.placement * placement))
         self.skeleton.enableSelfCollisionCheck()
         self.skeleton.enableAdjacentBodyCheck()
 
@@ -151,6 +145,19 @@ class DartArm:
                 pair = frozenset((one.getName(), other.getName()))
                 if pair not in self.robot.collision_pairs:
                     self._option.collisionFilter.addBodyNodePairToBlackList(one, other)
+
+    def _new_world(self) -> Any:
+        """An empty world with gravity."""
+        world = dart.simulation.World()
+        world.setTimeStep(self.physics_step)
+        world.setGravity([0.0, 0.0, -GRAVITY])
+        if self._detector is not None:
+            world.setCollisionDetector(self._detector.engine)
+        # DART must not deactivate an arm at rest: it would no longer follow small commands.
+        deactivation = world.getDeactivationOptions()
+        deactivation.mEnabled = False
+        world.setDeactivationOptions(deactivation)
+        return world
 
     def set_parameters(
         self,
@@ -265,20 +272,6 @@ class DartArm:
             _note_contacts(found, deepest)
 
 
-def _world(physics_step: float, detector: str) -> Any:
-    """An empty world with gravity."""
-    one_of("detector", detector, DETECTORS)
-    world = dart.simulation.World()
-    world.setTimeStep(physics_step)
-    world.setGravity([0.0, 0.0, -GRAVITY])
-    world.setCollisionDetector(getattr(dart.collision, DETECTORS[detector])())
-    # DART must not deactivate an arm at rest: it would no longer follow small commands.
-    deactivation = world.getDeactivationOptions()
-    deactivation.mEnabled = False
-    world.setDeactivationOptions(deactivation)
-    return world
-
-
 def _note_contacts(result: Any, deepest: dict[tuple[str, str], float]) -> None:
     """Enter the contacts of a result, for each pair of links the deepest."""
     for contact in result.getContacts():
@@ -294,33 +287,3 @@ def _isometry(placement: pin.SE3) -> Any:
 
 def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
     body.setInertia(dart.dynamics.Inertia(inertia.mass, inertia.lever, inertia.inertia))
-
-
-def _shape(robot: RobotModel, index: int) -> Any:
-    """DART's shape of one of the robot's collision shapes."""
-    match robot.shapes[index]:
-        case Box(size):
-            return dart.dynamics.BoxShape(size)
-        case Sphere(radius):
-            return dart.dynamics.SphereShape(radius)
-        case Cylinder(radius, length):
-            return dart.dynamics.CylinderShape(radius, length)
-        case Capsule(radius, length):
-            return dart.dynamics.CapsuleShape(radius, length)
-        case Mesh() as mesh:
-            return _mesh(mesh)
-
-
-def _mesh(mesh: Mesh) -> Any:
-    """DART's form of a mesh. DART reads meshes only from files, and only as parts of a URDF."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.stl"
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
-        urdf = (
-            f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(str(path))}/>'
-            "</geometry></collision></link></robot>"
-        )
-        skeleton = dart.utils.DartLoader().parseSkeletonString(urdf, "")
-    if skeleton is None:
-        raise GymMaraError(f"DART cannot read the mesh {mesh.path!r}")
-    return skeleton.getBodyNode(0).getShapeNode(0).getShape()

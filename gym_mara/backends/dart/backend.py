@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.backends.dart.arm import DETECTORS, DartArm
+from gym_mara.backends.dart.arm import DartArm
+from gym_mara.backends.dart.shapes import DETECTORS
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import Motion, ServoBackend, servo_motion
 from gym_mara.errors import GymMaraError, one_of

@@ -1,4 +1,4 @@
-"""Reads mesh files, each once in a process: units, axes, node transforms and parts are those that the file describes."""
+"""Reads mesh files, each once in a process: units, node transforms and parts are those that the file describes."""
 
 from __future__ import annotations
 
@@ -10,22 +10,29 @@ import trimesh
 
 from gym_mara.errors import GymMaraError
 from gym_mara.files import plain_size
+from gym_mara.robot.description.mesh_checks import check_dae, check_obj, check_ply
 from gym_mara.robot.description.shapes import Mesh
 
 _KEPT = 256
 """The number of meshes that are kept for the next robot."""
+FORMATS = (".dae", ".obj", ".ply", ".stl")
+_CHECKS = {".dae": check_dae, ".obj": check_obj, ".ply": check_ply}
+"""What trimesh does not check: it drops what it cannot read of such a file."""
 
 
 def read_mesh(path: Path, scale: tuple[float, float, float], *, convex: bool) -> Mesh:
     """The mesh of a file, or its convex hull.
 
+    The axes are those of the file: like RViz, Gazebo and MoveIt, this ignores the up-axis of a Collada file, because robots
+    are published so that they look right there. A negative scale mirrors the mesh; its triangles still face outwards.
+
     Args:
-        path: the file.
+        path: the file, in one of `FORMATS`.
         scale: along x, y and z.
         convex: whether to take the hull.
 
     Raises:
-        GymMaraError: the file is not a mesh, or holds no triangles or a vertex that is not finite.
+        GymMaraError: the format is not supported, the file is damaged, or it has no triangles.
     """
     return _scaled(path, (plain_size(path), path.stat().st_mtime_ns), scale, convex)
 
@@ -34,23 +41,35 @@ def read_mesh(path: Path, scale: tuple[float, float, float], *, convex: bool) ->
 def _scaled(
     path: Path, version: tuple[int, int], scale: tuple[float, float, float], convex: bool
 ) -> Mesh:
-    parts = [part.copy().apply_scale(scale) for part in _parts(path, version)]
     if convex:
-        parts = [trimesh.util.concatenate(parts).convex_hull]
-    return Mesh(str(path), tuple(parts), convex)
+        return _scaled(path, version, scale, convex=False).hull
+    parts = [part.copy().apply_scale(scale) for part in _parts(path, version)]
+    return Mesh(str(path), tuple(parts))
 
 
 @lru_cache(maxsize=_KEPT)
 def _parts(path: Path, version: tuple[int, int]) -> tuple[trimesh.Trimesh, ...]:
     """The parts of a mesh file in the file's frame, m."""
+    if path.suffix.lower() not in FORMATS:
+        raise GymMaraError(
+            f"the mesh {str(path)!r} has an unknown format; supported are {', '.join(FORMATS)}"
+        )
+    metre = 1.0
     try:
-        found = trimesh.load_scene(path).dump()
+        if check := _CHECKS.get(path.suffix.lower()):
+            metre = check(path)
+        # trimesh's processing would drop a vertex that is not finite, and its triangles.
+        found = trimesh.load_scene(path, process=False).dump()
     except Exception as error:  # the readers of the formats raise whatever their parsers do
         raise GymMaraError(f"the mesh {str(path)!r} cannot be read: {error}") from error
     parts = tuple(p for p in found if isinstance(p, trimesh.Trimesh) and len(p.faces))
     if not parts:
-        raise GymMaraError(f"the mesh {str(path)!r} has no triangles")
+        raise GymMaraError(f"the mesh {str(path)!r} has no triangles, or is cut off")
     for part in parts:
+        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+            raise GymMaraError(f"the mesh {str(path)!r} has a triangle of a missing vertex")
         if not np.isfinite(part.vertices).all():
             raise GymMaraError(f"the mesh {str(path)!r} has a vertex that is not finite")
+        part.process()
+        part.apply_scale(metre)
     return parts

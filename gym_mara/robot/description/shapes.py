@@ -73,5 +73,18 @@ class Mesh:
         faces = [part.faces + start for part, start in zip(self.parts, starts, strict=True)]
         return np.concatenate(faces).astype(np.int64)
 
+    @cached_property
+    def hull(self) -> Mesh:
+        """The convex hull of all parts; the mesh itself where it is one, or is flat and encloses no volume."""
+        if self.convex or self._is_flat():
+            return self
+        import trimesh  # few robots here have meshes
+
+        return Mesh(self.path, (trimesh.convex.convex_hull(self.vertices),), convex=True)
+
+    def _is_flat(self) -> bool:
+        lengths = np.linalg.svd(self.vertices - self.vertices.mean(axis=0), compute_uv=False)
+        return bool(lengths[-1] <= 1e-9 * lengths[0])
+
 
 Shape = Box | Sphere | Cylinder | Capsule | Mesh
