@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from gym_mara_mujoco import MujocoBackend, build_model
 
 from gym_mara.backends import make_backend
@@ -194,6 +195,35 @@ def test_mujoco_has_a_contact_wherever_links_touch(robot: RobotModel) -> None:
         data.qpos[:] = row
         mujoco.mj_forward(model, data)
         assert data.ncon
+
+
+@pytest.mark.parametrize("scale", ["1 1 1", "-1 1.5 0.8"])
+def test_convex_hulls_touch_where_coal_says(tmp_path: Path, scale: str) -> None:
+    """MuJoCo takes the hull of every mesh, here of an L; Coal takes it with `convex_hulls`."""
+    legs = [trimesh.creation.box(size) for size in ((0.3, 0.1, 0.1), (0.1, 0.1, 0.3))]
+    legs[0].apply_translation((0.1, 0.0, 0.0))
+    legs[1].apply_translation((0.0, 0.0, 0.1))
+    trimesh.util.concatenate(legs).export(tmp_path / "part.stl")
+    mesh = f'<geometry><mesh filename="part.stl" scale="{scale}"/></geometry></collision>'
+    fixed = f'<link name="rail"><collision><origin xyz="0.3 0.5 0"/>{mesh}'
+    text = SLIDER.replace('<link name="rail">', fixed)
+    path = tmp_path / "slider.urdf"
+    path.write_text(text.replace("</inertial>", f"</inertial><collision>{mesh}"))
+    robot = RobotModel.from_urdf(path, ee_frame="pole", convex_hulls=True)
+    model = build_model(robot, 0.002)
+    data, q = mujoco.MjData(model), uniform_q(robot, 300, 0)
+    flags = make_checker("coal", robot).check(q)
+    geometry_data = robot.geometry.createData()
+    assert flags.any()
+    assert not flags.all()
+    for row, flag in zip(q, flags, strict=True):
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        if (data.ncon > 0) != flag:
+            pin.computeDistances(
+                robot.model, robot.model.createData(), robot.geometry, geometry_data, row
+            )
+            assert abs(min(r.min_distance for r in geometry_data.distanceResults)) < 1e-3
 
 
 def test_the_table_stops_the_arm(mara: RobotModel) -> None:

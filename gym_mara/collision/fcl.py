@@ -18,7 +18,7 @@ with needs("the collision engine 'fcl'", "fcl"):
 
 
 class FclChecker(CollisionChecker):
-    """python-fcl, with meshes as sets of triangles.
+    """python-fcl, with meshes as sets of triangles and convex hulls as solids.
 
     Args:
         robot: the arm.
@@ -67,6 +67,10 @@ def _geometry(robot: RobotModel, index: int) -> Any:
             return fcl.Cylinder(radius, length)
         case Capsule(radius, length):
             return fcl.Capsule(radius, length)
+        case Mesh(convex=True) as hull:
+            # Solid, as in Coal. FCL wants the number of corners before each face's corners.
+            corners = np.column_stack([np.full(len(hull.faces), 3), hull.faces])
+            return fcl.Convex(hull.vertices, len(hull.faces), corners.ravel())
         case Mesh() as mesh:
             model = fcl.BVHModel()
             model.beginModel(len(mesh.vertices), len(mesh.faces))

@@ -115,11 +115,11 @@ def _meshes_of(placed: pin.GeometryObject, shape: Shape) -> list[tuple[trimesh.T
     own: Colour = (red, green, blue)
     if not isinstance(shape, Mesh):
         return [(_with_creases(_primitive(shape)), own)]
-    # STL stores no vertex normals, so creases are found by angle; the other formats store them.
-    is_stl = shape.path.lower().endswith(".stl")
+    # STL and hulls have no vertex normals, so creases are found by angle; the other formats store them.
+    unshaded = shape.convex or shape.path.lower().endswith(".stl")
     return [
         (
-            _with_creases(part) if is_stl else part,
+            _with_creases(part) if unshaded else part,
             own if placed.overrideMaterial else _colour_of(part),
         )
         for part in shape.parts

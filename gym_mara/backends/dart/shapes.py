@@ -1,4 +1,7 @@
-"""A robot's collision shapes in DART, and the collision detector that works with them."""
+"""A robot's collision shapes in DART, and the collision detector that works with them.
+
+DART's meshes are surfaces, convex hulls too: a body wholly inside one does not touch it.
+"""
 
 from __future__ import annotations
 

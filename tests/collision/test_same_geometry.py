@@ -1,0 +1,129 @@
+"""Every engine has the same geometry of meshes: Coal, python-fcl and DART agree wherever Coal sees no contact nearby."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from gym_mara.backends.dart.arm import DartArm
+from gym_mara.collision import make_checker
+from gym_mara.rendering.scene import Scene
+from gym_mara.robot import RobotModel
+from gym_mara.testing import uniform_q
+from tests.helpers import Floats, Mask, write
+from tests.robot.description.test_meshes import TWO_PARTS, dae
+from tests.shape_pairs import PRIMITIVES, held, wrong
+
+ENGINES = ("fcl", "dart with fcl", "dart with dart")
+MESHES = {
+    "concave": '<mesh filename="concave.stl"/>',
+    "two parts": '<mesh filename="parts.obj" scale="0.3 0.35 0.2"/>',
+    "millimetres": '<mesh filename="part.dae" scale="200 150 120"/>',
+    "mirrored": '<mesh filename="concave.stl" scale="-1 1.5 1"/>',
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the meshes: an L, two tetrahedra, and one in millimetres."""
+    legs = [trimesh.creation.box(size) for size in ((0.3, 0.1, 0.1), (0.1, 0.1, 0.3))]
+    legs[0].apply_translation((0.1, 0.0, 0.0))
+    legs[1].apply_translation((0.0, 0.0, 0.1))
+    trimesh.util.concatenate(legs).export(tmp_path / "concave.stl")
+    write(tmp_path / "parts.obj", TWO_PARTS)
+    write(tmp_path / "part.dae", dae("0.001"))
+    return tmp_path
+
+
+def _check(engine: str, robot: RobotModel, q: Floats) -> Mask:
+    name, _, detector = engine.partition(" with ")
+    if name != "dart":
+        return make_checker(name, robot).check(q)
+    arm, found = DartArm(robot, detector=detector), []
+    for row in q:
+        arm.reset(row)
+        found.append(bool(arm.contacts()))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("other", [*MESHES, *PRIMITIVES])
+@pytest.mark.parametrize("convex_hulls", [False, True], ids=["meshes", "hulls"])
+def test_engines_agree_on_a_mesh(folder: Path, engine: str, other: str, convex_hulls: bool) -> None:
+    shapes = PRIMITIVES | MESHES
+    for mesh in MESHES.values():
+        robot = held(folder, mesh, shapes[other], convex_hulls=convex_hulls)
+        coal = make_checker("coal", robot).check
+        assert wrong(robot, coal, functools.partial(_check, engine, robot), 80) == {}
+
+
+def _arm(folder: Path, shape: str) -> RobotModel:
+    """An arm of three links that have the same shape, 0.3 m apart."""
+    link = f'<collision><origin xyz="-0.03 -0.03 0.05"/><geometry>{shape}</geometry></collision>'
+    text = f'<link name="l0">{link}</link>'
+    for number in range(1, 4):
+        text += (
+            f'<link name="l{number}">{link}</link><joint name="j{number}" type="revolute">'
+            f'<parent link="l{number - 1}"/><child link="l{number}"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>'
+            '<limit lower="-2.6" upper="2.6" effort="9" velocity="1"/></joint>'
+        )
+    return RobotModel.from_urdf(write(folder / "arm.urdf", f'<robot name="a">{text}</robot>'), "l3")
+
+
+@pytest.mark.parametrize("engine", ["coal", *ENGINES])
+def test_a_mesh_in_millimetres_is_the_same_as_one_in_metres(folder: Path, engine: str) -> None:
+    write(folder / "metres.dae", dae(points="0 0 0 0.06 0 0 0 0.06 0 0 0 0.3"))
+    write(folder / "millimetres.dae", dae("0.001", points="0 0 0 60 0 0 0 60 0 0 0 300"))
+    flags = []
+    for name in ("metres", "millimetres"):
+        robot = _arm(folder, f'<mesh filename="{name}.dae"/>')
+        assert robot.extent < 1.5
+        flags.append(_check(engine, robot, uniform_q(robot, 100, 0)))
+    assert flags[0].any()
+    assert not flags[0].all()
+    np.testing.assert_array_equal(flags[0], flags[1])
+
+
+@pytest.mark.parametrize("engine", ["coal", *ENGINES])
+def test_both_parts_of_a_mesh_collide(folder: Path, engine: str) -> None:
+    """Where the parts, which are 0.4 m apart, hold the box between them, and where one of them holds it."""
+    mesh = '<mesh filename="parts.obj" scale="0.1 0.1 0.1"/>'
+    robot = held(folder, '<box size="0.1 0.1 0.1"/>', mesh)
+    q = np.zeros((3, 6))
+    q[:, 0] = -0.02, -0.3, -0.52
+    assert _check(engine, robot, q).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("engine", ["coal", "fcl"])
+def test_a_hull_is_solid(folder: Path, engine: str) -> None:
+    ball = trimesh.creation.icosphere(radius=0.2)
+    ball.export(folder / "ball.stl")
+    q = np.full((1, 6), 0.01)
+    for convex_hulls in (False, True):
+        robot = held(
+            folder,
+            '<mesh filename="ball.stl"/>',
+            '<sphere radius="0.02"/>',
+            convex_hulls=convex_hulls,
+        )
+        assert _check(engine, robot, q).tolist() == [convex_hulls]
+
+
+@pytest.mark.parametrize("name", ["a#b", "a?b", "a%20b", "a b", "ä–ü", "a'b"])
+@pytest.mark.parametrize("scheme", ["", "file://", "package://"])
+def test_a_path_of_any_characters_works_on_every_engine(
+    tmp_path: Path, name: str, scheme: str
+) -> None:
+    folder = tmp_path / name
+    folder.mkdir()
+    trimesh.creation.box((0.2, 0.2, 0.2)).export(folder / f"{name}.stl")
+    place = {"": "", "file://": f"file://{folder}/", "package://": f"package://{name}/"}[scheme]
+    robot = held(folder, f'<mesh filename="{place}{name}.stl"/>', '<sphere radius="0.1"/>')
+    q = np.array([[0.1, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    for engine in ("coal", *ENGINES):
+        assert _check(engine, robot, q).all()
+    assert len(Scene(robot).parts[0].vertices) >= 8
