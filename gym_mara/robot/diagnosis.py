@@ -8,12 +8,14 @@ from typing import Literal
 
 from gym_mara.errors import GymMaraError
 
+Severity = Literal["error", "warning", "note"]
+
 
 @dataclass(frozen=True)
 class Finding:
     """Something in a robot's description that a user should know."""
 
-    severity: Literal["error", "warning", "note"]
+    severity: Severity
     """An error cannot be simulated faithfully; a warning can, but is probably not meant; a note is for the table alone."""
     part: str
     """What it is about: "joint j1", "link l2", "links l1 and l3", "robot"."""

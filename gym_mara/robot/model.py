@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -15,14 +16,18 @@ import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
+from gym_mara.robot.bounds import Bounds
 from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
+from gym_mara.robot.description.checks import check_urdf
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
+from gym_mara.robot.description.off_chain import Follower, keep_chain
 from gym_mara.robot.description.shapes import Shape
-from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
-from gym_mara.robot.diagnosis import Finding, raise_errors
+from gym_mara.robot.description.srdf import Semantics, read_srdf
+from gym_mara.robot.description.urdf import build, ee_frame_among_links, find_chain
+from gym_mara.robot.description.xml_files import read_xml
+from gym_mara.robot.diagnosis import Finding, Severity, raise_errors
 from gym_mara.robot.geometry import Geometry, read_geometry
-from gym_mara.robot.kinematics import Kinematics
+from gym_mara.robot.kinematics import Kinematics, motion_axis
 from gym_mara.robot.options import RobotOptions
 from gym_mara.types import Floats
 
@@ -31,7 +36,7 @@ from gym_mara.types import Floats
 class RobotModel:
     """A fixed-base arm: the chain of joints from the world to the end-effector frame, with all links attached to it.
 
-    Joints off the chain (a gripper's fingers) are locked. Arrays are read-only, (J,), in the order of the chain.
+    Joints off the chain (a gripper's fingers) are locked, or follow one of the chain that they mimic. Arrays are read-only, (J,), in the order of the chain.
     """
 
     name: str
@@ -41,9 +46,11 @@ class RobotModel:
     modules: tuple[str, ...]
     """The modules that the arm was composed of, from the base to the tool; empty otherwise."""
     xml: str
-    """The URDF as text, with all joints off the chain fixed."""
+    """The URDF as text, with all joints off the chain fixed, but for `followers`."""
     ee_frame: str
     joint_names: tuple[str, ...]
+    followers: tuple[Follower, ...]
+    """The joints off the chain that mimic one of it; in `model` they come after the chain, in this order."""
     lower: Floats
     """Lower position limits, rad (m for a prismatic joint)."""
     upper: Floats
@@ -56,7 +63,7 @@ class RobotModel:
     collision_pairs: frozenset[frozenset[str]]
     """The pairs of links that may collide."""
     model: pin.Model
-    """Pinocchio's model, its joints those of `joint_names`."""
+    """Pinocchio's model, its joints those of `joint_names`, then `followers`; its configurations are (J,)."""
     geometry: pin.GeometryModel
     """Pinocchio's collision geometry, with its collision pairs set."""
     shapes: tuple[Shape, ...]
@@ -75,7 +82,7 @@ class RobotModel:
         A RobotModel is returned as it is.
 
         Args:
-            robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
+            robot: the robot. A path ends in ".urdf" or ".xml", or has a folder ("./arm"); an SRDF of the same name beside it is read too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
             **options: fields of `RobotOptions`.
 
@@ -104,6 +111,10 @@ class RobotModel:
             srdf = path.with_suffix(".srdf")
             srdf_there = srdf if srdf.is_file() else None
             return cls._from_files(path, ee_frame, srdf_there, None, own, warn=True)
+        if robot not in catalog.robot_names() and robot and os.path.lexists(robot):
+            raise GymMaraError(
+                f"robot={robot!r} is no robot's name; for the file of that name write {os.path.join('.', robot)!r}"
+            )
         files = catalog.find(robot)
         return cls._from_files(
             files.urdf,
@@ -161,13 +172,14 @@ class RobotModel:
         warn: bool = False,
     ) -> RobotModel:
         root = read_xml(urdf, "URDF")
+        severity: Severity = "warning" if own_files else "note"
+        findings = check_urdf(urdf, root, options.package_dirs, severity)
         semantics = read_srdf(srdf) if srdf else Semantics()
         ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
-        findings = []
         if unknown := semantics.unknown_names(root):
             findings.append(
                 Finding(
-                    "warning" if own_files else "note",
+                    severity,
                     f"SRDF {str(srdf)!r}",
                     f"it names links or joints that the URDF lacks: {', '.join(unknown)}",
                     "they are ignored",
@@ -215,10 +227,10 @@ class RobotModel:
         of_files: Sequence[Finding],
         modules: tuple[str, ...] = (),
     ) -> RobotModel:
-        check_urdf(urdf, root, options.package_dirs)
-        chain = make_chain(urdf, root, ee_frame)
+        chain = find_chain(urdf, root, ee_frame)
+        followers = keep_chain(urdf, root, chain, semantics.home_pose(chain).values)
+        model, of_parser = build(urdf, root, chain, followers)
         xml = ElementTree.tostring(root, encoding="unicode")
-        model = build(urdf, xml)
         hulls = options.convex_hulls
         geometry, shapes = read_geometry(
             urdf, xml, model, "collision", options.package_dirs, convex_hulls=hulls
@@ -226,7 +238,7 @@ class RobotModel:
         limits = model.lowerPositionLimit, model.upperPositionLimit
         home = np.clip(semantics.home(chain), *limits)
         name = name or root.get("name") or urdf.stem
-        findings = tuple(of_files)
+        findings = (*of_files, *of_parser)
         raise_errors(name, findings, dynamics=False)
         return cls(
             name=name,
@@ -235,7 +247,10 @@ class RobotModel:
             modules=modules,
             xml=xml,
             ee_frame=ee_frame,
-            joint_names=tuple(model.names)[1:],
+            joint_names=chain,
+            followers=tuple(
+                sorted(followers, key=lambda follower: model.getJointId(follower.name))
+            ),
             lower=_read_only(model.lowerPositionLimit),
             upper=_read_only(model.upperPositionLimit),
             velocity_limit=_read_only(options.limits("velocity_limit", chain, model.velocityLimit)),
@@ -280,43 +295,35 @@ class RobotModel:
         """
         raise_errors(self.name, self.findings, dynamics=True)
 
+    def motion(self, number: int) -> Floats:
+        """The motion subspace (6,) of a joint of `model`, in its own frame: linear part, then angular.
+
+        Args:
+            number: Pinocchio's index of the joint, from 1.
+        """
+        motion = motion_axis(self.model.joints[number])
+        if number > self.num_joints:  # Pinocchio gives it per unit of the leader
+            motion = motion / self.followers[number - 1 - self.num_joints].multiplier
+        return motion
+
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""
         return Kinematics(self.model, self.ee_frame_id)
 
     @cached_property
     def reach(self) -> Floats:
-        """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or 1 if prismatic."""
-        reach = np.zeros(self.num_joints)
-        for body, point in self._points():
-            for joint in range(body):
-                reach[joint] = max(reach[joint], self._lengths[joint + 1 : body].sum() + point)
-        reach[self.kinematics().prismatic] = 1.0
-        return _read_only(reach)
+        """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or m/m if prismatic."""
+        return _read_only(self.bounds.reach)
 
-    @cached_property
+    @property
     def extent(self) -> float:
         """A bound on how far any point of the arm can be from the world's origin, m."""
-        return max(float(self._lengths[:body].sum() + point) for body, point in self._points())
+        return self.bounds.extent
 
     @cached_property
-    def _lengths(self) -> Floats:
-        """A bound (J,) on how far each joint's origin is from that of the joint before, m; the first from the world's."""
-        slides = self.kinematics().prismatic
-        span = np.where(slides, np.maximum(abs(self.lower), abs(self.upper)), 0.0)
-        return span + [np.linalg.norm(p.translation) for p in self.model.jointPlacements[1:]]
-
-    def _points(self) -> list[tuple[int, float]]:
-        """Bounds on how far the arm's points are from the joint that carries them: joint number, m."""
-        frame = self.model.frames[self.ee_frame_id]
-        points = [(int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)))]
-        for geometry_object in self.geometry.geometryObjects:
-            shape, body = geometry_object.geometry, geometry_object.parentJoint
-            if body > 0:
-                shape.computeLocalAABB()
-                centre = geometry_object.placement.act(shape.aabb_center)
-                points.append((body, float(np.linalg.norm(centre) + shape.aabb_radius)))
-        return points
+    def bounds(self) -> Bounds:
+        """How far the joints move the arm's points."""
+        return Bounds.of(self.model, self.geometry, self.ee_frame_id, self.followers)
 
     def link_of(self, geometry_index: int) -> str:
         """The name of the link that a collision shape belongs to, given the shape's index."""
@@ -367,7 +374,10 @@ class RobotModel:
 
 def is_path(robot: object) -> TypeGuard[str | Path]:
     """Whether a robot is given by the path of its URDF."""
-    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))
+    if isinstance(robot, str):
+        name = robot.lower()
+        return name.endswith((".urdf", ".xml", ".xacro")) or os.sep in name or "/" in name
+    return isinstance(robot, Path)
 
 
 RobotLike = str | Sequence[str] | RobotModel

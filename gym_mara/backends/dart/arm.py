@@ -17,7 +17,6 @@ from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Sphere
-from gym_mara.robot.kinematics import motion_axis
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -36,7 +35,7 @@ DETECTORS = {
 LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
 # DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
-_NO_MASS = 1e-9
+_NO_INERTIA = pin.Inertia(1e-9, np.zeros(3), 1e-9 * np.eye(3))
 
 
 class DartArm:
@@ -68,12 +67,16 @@ class DartArm:
         self.physics_step = physics_step
         self.skeleton = dart.dynamics.Skeleton(robot.name)
         self.bodies = self._build_bodies()
-        self._joints = [body.getParentJoint() for body in self.bodies[1:]]
+        joints = [body.getParentJoint() for body in self.bodies[1:]]
+        self._joints, followers = joints[: robot.num_joints], joints[robot.num_joints :]
         speed = robot.velocity_limit if velocity_limit is None else velocity_limit
         if servo:
             for joint in self._joints:
                 joint.setActuatorType(dart.dynamics.SERVO)
             self.set_parameters()
+        for joint in followers:
+            joint.setActuatorType(dart.dynamics.VELOCITY)
+        self._command = self._command_all if followers else self.skeleton.setCommands
         if detector is not None:
             self._build_shapes()
         self.world = _world(physics_step, detector or "fcl")
@@ -98,7 +101,7 @@ class DartArm:
         bodies = [self.skeleton.createWeldJointAndBodyNodePair()[1]]
         _set_inertia(bodies[0], pin.Inertia(1.0, np.zeros(3), np.eye(3)))
         for number in range(1, model.njoints):
-            linear, angular = np.split(motion_axis(model.joints[number]), 2)
+            linear, angular = np.split(self.robot.motion(number), 2)
             parent = bodies[model.parents[number]]
             if angular.any():
                 properties = dart.dynamics.RevoluteJointProperties()
@@ -110,8 +113,12 @@ class DartArm:
             properties.mAxis = angular if angular.any() else linear
             properties.mT_ParentBodyToJoint = _isometry(model.jointPlacements[number])
             joint, body = create(properties)
-            joint.setDampingCoefficient(0, model.damping[number - 1])
-            _set_inertia(body, model.inertias[number])
+            inertia = model.inertias[number]
+            if number <= self.robot.num_joints:
+                joint.setDampingCoefficient(0, model.damping[number - 1])
+            elif inertia.mass <= 0.0:
+                inertia = _NO_INERTIA
+            _set_inertia(body, inertia)
             bodies.append(body)
         return bodies
 
@@ -126,7 +133,7 @@ class DartArm:
                 body = unnamed.pop(number, None)
                 if body is None:
                     body = self.bodies[number].createWeldJointAndBodyNodePair()[1]
-                    _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
+                    _set_inertia(body, _NO_INERTIA)
                 body.setName(link)
                 links[link] = body
             node = links[link].createShapeNode(_shape(self.robot, index))
@@ -165,7 +172,9 @@ class DartArm:
         friction = model.friction if joint_friction is None else joint_friction
         effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
         mass, friction = np.broadcast_to(mass, count), np.broadcast_to(friction, count)
-        for index, (joint, body) in enumerate(zip(self._joints, self.bodies[1:], strict=True)):
+        for index, (joint, body) in enumerate(
+            zip(self._joints, self.bodies[1 : 1 + count], strict=True)
+        ):
             joint.setForceLowerLimit(0, -effort[index])
             joint.setForceUpperLimit(0, effort[index])
             joint.setCoulombFriction(0, friction[index])
@@ -182,8 +191,9 @@ class DartArm:
 
     def set_state(self, q: Floats, qd: Floats) -> None:
         """Put the arm at q, rad, with velocities qd, rad/s; both (J,)."""
-        self.skeleton.setPositions(q)
-        self.skeleton.setVelocities(qd)
+        followers = self.robot.followers
+        self.skeleton.setPositions(np.append(q, [each.position(q) for each in followers]))
+        self.skeleton.setVelocities(np.append(qd, [each.velocity(qd) for each in followers]))
         self.skeleton.resetAccelerations()
         self.skeleton.resetCommands()
         self.skeleton.clearConstraintImpulses()
@@ -191,17 +201,17 @@ class DartArm:
     @property
     def q(self) -> Floats:
         """Joint positions (J,), rad."""
-        return np.asarray(self.skeleton.getPositions())
+        return np.asarray(self.skeleton.getPositions())[: self.robot.num_joints]
 
     @property
     def qd(self) -> Floats:
         """Joint velocities (J,), rad/s."""
-        return np.asarray(self.skeleton.getVelocities())
+        return np.asarray(self.skeleton.getVelocities())[: self.robot.num_joints]
 
     @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
-        return np.asarray(self.skeleton.getConstraintForces())
+        return np.asarray(self.skeleton.getConstraintForces())[: self.robot.num_joints]
 
     def run(self, velocities: Floats) -> tuple[Contact, ...]:
         """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts in any of them.
@@ -218,11 +228,31 @@ class DartArm:
                     break
                 self._run_with_contacts(block, deepest)
             else:
-                command, step = self.skeleton.setCommands, self._free_world.step
+                command, step = self._command, self._free_world.step
                 for velocity in block:
                     command(velocity)
                     step()
+        if self.robot.followers:
+            self._let_follow()
         return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
+
+    def _command_all(self, velocities: Floats) -> None:
+        """Command the velocities of the motors (J,), rad/s, for one physics step, and those of the joints that follow."""
+        count, dt = self.robot.num_joints, self.physics_step
+        q = self.skeleton.getPositions()
+        after = q[:count] + dt * velocities
+        ways = [
+            each.position(after) - here
+            for each, here in zip(self.robot.followers, q[count:], strict=True)
+        ]
+        self.skeleton.setCommands(np.append(velocities, np.array(ways) / dt))
+
+    def _let_follow(self) -> None:
+        """Put the joints that follow exactly where they belong, so that q and q̇ are the whole state."""
+        q, qd = self.q, self.qd
+        for index, each in enumerate(self.robot.followers, self.robot.num_joints):
+            self.skeleton.setPosition(index, each.position(q))
+            self.skeleton.setVelocity(index, each.velocity(qd))
 
     def contacts(self) -> tuple[Contact, ...]:
         """The contacts at the current state."""
@@ -232,7 +262,7 @@ class DartArm:
 
     def may_touch(self) -> bool:
         """Whether any links could touch within the next block of steps."""
-        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        q, qd = self.q, self.qd
         slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
         return bool(not slow or self._clearance.check(q[None])[0])
 
@@ -242,7 +272,7 @@ class DartArm:
         group = self.world.getConstraintSolver().getCollisionGroup()
         group.removeAllShapeFrames()
         group.addShapeFramesOf(self.skeleton)
-        command, step = self.skeleton.setCommands, self.world.step
+        command, step = self._command, self.world.step
         result = self.world.getLastCollisionResult
         for velocity in velocities:
             command(velocity)
