@@ -74,6 +74,7 @@ class DartArm:
             for joint in self._joints:
                 joint.setActuatorType(dart.dynamics.SERVO)
             self.set_parameters()
+        # They are driven along: contacts do not hold them back, nor act on the joints that they mimic.
         for joint in followers:
             joint.setActuatorType(dart.dynamics.VELOCITY)
         self._command = self._command_all if followers else self.skeleton.setCommands
@@ -209,6 +210,18 @@ class DartArm:
         return np.asarray(self.skeleton.getVelocities())[: self.robot.num_joints]
 
     @property
+    def followers(self) -> Floats:
+        """Positions and velocities of the joints that follow others (2, F), rad and rad/s; they lag in a jam."""
+        state = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        return np.array(state)[:, self.robot.num_joints :]
+
+    @followers.setter
+    def followers(self, state: Floats) -> None:
+        for index, (q, qd) in enumerate(state.T.tolist(), self.robot.num_joints):
+            self.skeleton.setPosition(index, q)
+            self.skeleton.setVelocity(index, qd)
+
+    @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
         return np.asarray(self.skeleton.getConstraintForces())[: self.robot.num_joints]
@@ -232,27 +245,17 @@ class DartArm:
                 for velocity in block:
                     command(velocity)
                     step()
-        if self.robot.followers:
-            self._let_follow()
         return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
 
     def _command_all(self, velocities: Floats) -> None:
         """Command the velocities of the motors (J,), rad/s, for one physics step, and those of the joints that follow."""
-        count, dt = self.robot.num_joints, self.physics_step
+        count, step = self.robot.num_joints, self.physics_step
         q = self.skeleton.getPositions()
-        after = q[:count] + dt * velocities
-        ways = [
-            each.position(after) - here
-            for each, here in zip(self.robot.followers, q[count:], strict=True)
-        ]
-        self.skeleton.setCommands(np.append(velocities, np.array(ways) / dt))
-
-    def _let_follow(self) -> None:
-        """Put the joints that follow exactly where they belong, so that q and q̇ are the whole state."""
-        q, qd = self.q, self.qd
-        for index, each in enumerate(self.robot.followers, self.robot.num_joints):
-            self.skeleton.setPosition(index, each.position(q))
-            self.skeleton.setVelocity(index, each.velocity(qd))
+        after = q[:count] + step * velocities
+        wanted = [each.position(after) for each in self.robot.followers]
+        speed = [abs(each.velocity(self._fastest)) for each in self.robot.followers]
+        follow = np.clip((wanted - q[count:]) / step, np.negative(speed), speed)
+        self.skeleton.setCommands(np.append(velocities, follow))
 
     def contacts(self) -> tuple[Contact, ...]:
         """The contacts at the current state."""
