@@ -28,11 +28,20 @@ def limits_of(urdf: Path, joint: ElementTree.Element) -> tuple[float, float]:
     return lower, upper
 
 
-def axis_of(joint: ElementTree.Element) -> Floats:
-    """The unit vector of a joint's axis (3,); zeros if it has no direction."""
+def axis_of(urdf: Path, joint: ElementTree.Element) -> Floats:
+    """The unit vector of a joint's axis (3,).
+
+    Raises:
+        GymMaraError: it has length zero.
+    """
     element = joint.find("axis")
     axis = vector("1 0 0" if element is None else element.get("xyz", "1 0 0"))
-    return axis / (np.linalg.norm(axis) or 1.0)
+    length = float(np.linalg.norm(axis))
+    if length == 0.0:
+        raise GymMaraError(
+            f"{str(urdf)!r}: the axis of joint {joint.get('name')!r} has length zero"
+        )
+    return axis / length
 
 
 def vector(text: str) -> Floats:

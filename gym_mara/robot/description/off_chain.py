@@ -57,7 +57,7 @@ def keep_chain(
         locked: joint name → position, rad (m), of joints off the chain; the others are locked at 0.
 
     Raises:
-        GymMaraError: a joint mimics itself or an unknown joint, or the limits of a locked joint are in the wrong order.
+        GymMaraError: a joint mimics itself or an unknown joint or has no direction, or its limits are in the wrong order.
     """
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     positions = {name: _position(urdf, joints, chain, locked, name) for name in joints}
@@ -66,8 +66,9 @@ def keep_chain(
             if joint.get("type") == "continuous":
                 _make_revolute(joint)
         elif positions[name].leader < 0:
-            _fix(joint, positions[name].offset)
+            _fix(urdf, joint, positions[name].offset)
         else:
+            axis_of(urdf, joint)
             _follow(joint, chain[positions[name].leader], positions[name])
     return tuple(p for name, p in positions.items() if name not in chain and p.leader >= 0)
 
@@ -85,11 +86,10 @@ def _position(
     while name not in chain:
         joint = joints[name]
         mimic = joint.find("mimic")
-        if joint.get("type") not in _MOVING:
-            return Follower(passed[0], -1, 0.0, offset)
-        if mimic is None:
-            at = _clipped(urdf, joint, locked.get(name, ()))
-            return Follower(passed[0], -1, 0.0, multiplier * at + offset)
+        if joint.get("type") not in _MOVING or mimic is None:
+            offset += multiplier * _lock(urdf, joint, locked.get(name, ()))
+            multiplier = 0.0
+            break
         offset += multiplier * float(mimic.get("offset", "0"))
         multiplier *= float(mimic.get("multiplier", "1"))
         name = mimic.get("joint", "")
@@ -105,8 +105,10 @@ def _position(
     return Follower(passed[0], chain.index(name) if multiplier else -1, multiplier, offset)
 
 
-def _clipped(urdf: Path, joint: ElementTree.Element, position: Sequence[float]) -> float:
+def _lock(urdf: Path, joint: ElementTree.Element, position: Sequence[float]) -> float:
     """Where to lock a joint: at a position, else at 0, within its limits."""
+    if joint.get("type") not in _MOVING:
+        return 0.0
     at = position[0] if len(position) == 1 else 0.0
     if joint.get("type") == "continuous":
         return at
@@ -117,14 +119,14 @@ def _clipped(urdf: Path, joint: ElementTree.Element, position: Sequence[float]) 
     return min(max(at, lower), upper)
 
 
-def _fix(joint: ElementTree.Element, position: float) -> None:
+def _fix(urdf: Path, joint: ElementTree.Element, position: float) -> None:
     """Make a joint fixed at a position, rad (m)."""
     if position:
         origin = joint.find("origin")
         if origin is None:
             origin = ElementTree.SubElement(joint, "origin")
         xyz, rpy = (vector(origin.get(name, "0 0 0")) for name in ("xyz", "rpy"))
-        rotation, axis = pin.rpy.rpyToMatrix(rpy), axis_of(joint)
+        rotation, axis = pin.rpy.rpyToMatrix(rpy), axis_of(urdf, joint)
         if joint.get("type") == "prismatic":
             xyz = xyz + rotation @ axis * position
         else:

@@ -53,6 +53,14 @@ def _mutated_text(text: str, random: random.Random) -> str:
     return text.replace(f'"{first}"', f'"{second}"', random.randint(1, 3))
 
 
+def _move(
+    child: ElementTree.Element, parent: ElementTree.Element, other: ElementTree.Element
+) -> None:
+    if other not in child.iter():
+        parent.remove(child)
+        other.append(child)
+
+
 def _mutated_tree(text: str, random: random.Random) -> str:
     """A URDF with one change of its elements: lost, repeated, moved, renamed; or of an attribute."""
     root = ElementTree.fromstring(text)
@@ -65,7 +73,7 @@ def _mutated_tree(text: str, random: random.Random) -> str:
     changes: list[Callable[[], object]] = [
         lambda: parent.remove(child),
         lambda: parent.append(ElementTree.fromstring(ElementTree.tostring(child))),
-        lambda: (parent.remove(child), other.append(child)) if other not in child.iter() else None,
+        lambda: _move(child, parent, other),
         lambda: setattr(child, "tag", random.choice([*NAMES, child.tag.upper()])),
         lambda: parent.__setitem__(slice(None), list(parent)[::-1]),
         lambda: setattr(other, "text", "1 2 3"),

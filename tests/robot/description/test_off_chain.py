@@ -180,6 +180,14 @@ def test_a_bad_mimic_joint_is_an_error(tmp_path: Path, mimic: str, message: str)
         _load(tmp_path, _finger("revolute", extra=f"<mimic {mimic}/>"))
 
 
+def test_a_joint_off_the_chain_needs_a_direction_to_move_in(tmp_path: Path) -> None:
+    mimic = '<mimic joint="j1"/>'
+    for finger in (_finger("revolute", extra=mimic), _finger("revolute", LIMIT.format(1, 2))):
+        with pytest.raises(GymMaraError, match="the axis of joint 'jf' has length zero"):
+            _load(tmp_path, finger.replace("1 2 3", "0 0 0"))
+    assert _load(tmp_path, _finger("revolute", LIMIT.format(0, 2), "0 0 0")).num_joints == 3
+
+
 @pytest.fixture
 def with_bar(tmp_path: Path) -> RobotModel:
     return _load(tmp_path, BAR.format(name="bar", limit=LIMIT.format(-2, 2)))
