@@ -100,6 +100,37 @@ def urdf_xml(*joints: str) -> str:
     return f'<robot name="stick">{links}{"".join(joints)}</robot>'
 
 
+def upright_arm(extra: str = "") -> str:
+    """The URDF of an arm of three joints, j1 about z, j2 and j3 about y, on a box; its links are base, l1, l2, l3 and tool.
+
+    Args:
+        extra: more elements.
+    """
+    moving = "".join(
+        f"""
+      <link name="l{number}">
+        <inertial><origin xyz="0 0 0.15"/><mass value="1"/>
+          <inertia ixx="0.01" iyy="0.01" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial>
+        <collision><origin xyz="0 0 0.15"/><geometry><box size="0.06 0.06 0.22"/></geometry></collision>
+      </link>
+      <joint name="j{number}" type="revolute">
+        <parent link="{"base" if number == 1 else f"l{number - 1}"}"/><child link="l{number}"/>
+        <origin xyz="0 0 {0.02 if number == 1 else 0.3}"/><axis xyz="{"0 0 1" if number == 1 else "0 1 0"}"/>
+        <limit lower="-2" upper="2" effort="50" velocity="2"/>
+      </joint>"""
+        for number in (1, 2, 3)
+    )
+    return f"""<robot name="upright">
+      <link name="base">
+        <collision><origin xyz="0 0 -0.05"/><geometry><box size="0.3 0.3 0.1"/></geometry></collision>
+      </link>{moving}
+      <link name="tool"/>
+      <joint name="jt" type="fixed">
+        <parent link="l3"/><child link="tool"/><origin xyz="0 0 0.3"/>
+      </joint>{extra}
+    </robot>"""
+
+
 def write(path: Path, text: str) -> Path:
     """Write a file and return its path."""
     path.write_text(text)

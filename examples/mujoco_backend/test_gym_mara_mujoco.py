@@ -309,3 +309,20 @@ def test_arms_in_worker_processes_move_as_in_one(mara: RobotModel) -> None:
             np.testing.assert_array_equal(spread.step(targets).q, alone.step(targets).q)
     finally:
         spread.close()
+
+
+def test_a_joint_that_mimics_another_follows_it(tmp_path: Path) -> None:
+    bar = """
+      <joint name="bar" type="revolute"><parent link="rail"/><child link="bar"/><axis xyz="0 1 0"/>
+        <mimic joint="hinge" multiplier="-2" offset="0.1"/></joint>
+      <link name="bar"/>"""
+    (tmp_path / "slider.urdf").write_text(SLIDER.replace("</robot>", f"{bar}</robot>"))
+    robot = RobotModel.from_urdf(tmp_path / "slider.urdf", ee_frame="pole")
+    backend = MujocoBackend(robot, 1)
+    for target in np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2)):
+        for _ in range(10):
+            state = backend.step(target[None])
+            assert state.q.shape == (1, 2)
+            bar_q = backend._arms[0].qpos[2]
+            np.testing.assert_allclose(bar_q, -2.0 * state.q[0, 1] + 0.1, atol=1e-2)
+    assert abs(state.q[0, 1]) > 0.01

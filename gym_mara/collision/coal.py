@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.robot import RobotModel
+from gym_mara.robot.bounds import joints_to
 from gym_mara.robot.description.shapes import Mesh
 from gym_mara.robot.geometry import coal_mesh
 from gym_mara.types import Floats, Mask
@@ -74,15 +75,13 @@ def approach_bounds(robot: RobotModel, displacement: Floats) -> Floats:
 
     Only the joints between the two links of a pair move one relative to the other.
     """
-    model, objects = robot.model, robot.geometry.geometryObjects
-    joints_to: list[frozenset[int]] = [frozenset()]
-    for body in range(1, model.njoints):
-        joints_to.append(joints_to[model.parents[body]] | {body - 1})
-    length = robot.reach * displacement
+    objects = robot.geometry.geometryObjects
+    ways = [frozenset(joints_to(robot.model, body)) for body in range(robot.model.njoints)]
+    travel = robot.bounds.travel(displacement)
     bounds = []
     for pair in robot.geometry.collisionPairs:
-        one, other = (joints_to[objects[end].parentJoint] for end in (pair.first, pair.second))
-        bounds.append(length[sorted(one ^ other)].sum())
+        one, other = (ways[objects[end].parentJoint] for end in (pair.first, pair.second))
+        bounds.append(travel[sorted(one ^ other)].sum())
     return np.array(bounds)
 
 

@@ -100,14 +100,14 @@ class Overlaps:
 
 
 def _candidates(robot: RobotModel) -> list[_Pair]:
-    """Every ball in a moving shape with every fixed box that may collide with the shape, the outermost body first."""
+    """Every ball in a shape on the chain with every fixed box that may collide with it, the outermost body first."""
     objects = robot.geometry.geometryObjects
     found = []
     for pair in robot.geometry.collisionPairs:
         ends = pair.first, pair.second
         for one, other in (ends, ends[::-1]):
             moving, fixed = objects[one], objects[other]
-            if moving.parentJoint == 0 or fixed.parentJoint != 0:
+            if not 1 <= moving.parentJoint <= robot.num_joints or fixed.parentJoint != 0:
                 continue
             box = robot.shapes[other]
             if isinstance(box, Box):

@@ -37,6 +37,8 @@ def fingerprint(robot: RobotModel) -> str:
     add(model.friction, model.damping, model.armature)
     for joint, placement in zip(model.joints[1:], model.jointPlacements[1:], strict=True):
         add(placement.homogeneous, motion_axis(joint))
+    for follower in robot.followers:
+        add(follower.name, *follower[1:])
     for inertia in model.inertias:
         add(inertia.mass, inertia.lever, inertia.inertia)
     for geometry_object, shape in zip(robot.geometry.geometryObjects, robot.shapes, strict=True):

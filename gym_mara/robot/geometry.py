@@ -17,8 +17,8 @@ import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot.description.mesh_files import mesh_file
+from gym_mara.robot.description.parser import parsing
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
-from gym_mara.robot.description.urdf import named_in_errors
 
 _KEPT = 256
 """The number of Coal's meshes that are kept for the next robot."""
@@ -72,7 +72,7 @@ def read_geometry(
                 checking.remove(hull)
     text = ElementTree.tostring(root, encoding="unicode")
     of_kind = pin.GeometryType.COLLISION if kind == "collision" else pin.GeometryType.VISUAL
-    with named_in_errors(urdf):
+    with parsing(urdf):
         geometry_model = pin.buildGeomFromUrdfString(model, text, of_kind)
     shapes: list[Shape] = []
     for geometry_object in geometry_model.geometryObjects:

@@ -13,11 +13,14 @@ import numpy as np
 
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import set_collision_pairs
+from gym_mara.robot.description.checks import check_urdf
 from gym_mara.robot.description.empty_shapes import drop_empty_shapes
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
-from gym_mara.robot.description.srdf import Semantics, read_srdf, read_xml
+from gym_mara.robot.description.off_chain import keep_chain
+from gym_mara.robot.description.srdf import Semantics, read_srdf
 from gym_mara.robot.description.target import Target, read_target
-from gym_mara.robot.description.urdf import build, check_urdf, ee_frame_among_links, make_chain
+from gym_mara.robot.description.urdf import build, ee_frame_among_links, find_chain
+from gym_mara.robot.description.xml_files import read_xml
 from gym_mara.robot.diagnosis import (
     Finding,
     collision_findings,
@@ -59,12 +62,13 @@ def from_files(
         GymMaraError: a file is missing or broken, or describes no fixed-base arm.
     """
     root = read_xml(urdf, "URDF")
+    of_files = check_urdf(urdf, root, options.package_dirs)
     semantics = read_srdf(srdf) if srdf else Semantics()
     ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
     target = read_target(urdf)
     robot = _build(cls, root, semantics, ee_frame, name, urdf, srdf, (), target, options)
-    of_srdf = semantics_findings(srdf, semantics, root) if srdf else []
-    return _with_findings(robot, findings, of_srdf)
+    of_files += semantics_findings(srdf, semantics, root) if srdf else []
+    return _with_findings(robot, findings, of_files)
 
 
 def from_modules(
@@ -100,11 +104,11 @@ def _build(
     options: RobotOptions,
 ) -> RobotModel:
     """The arm of a URDF that has been read, without findings."""
-    check_urdf(urdf, root, options.package_dirs)
     empty = drop_empty_shapes(root)
-    chain = make_chain(urdf, root, ee_frame)
+    chain = find_chain(urdf, root, ee_frame)
+    followers = keep_chain(urdf, root, chain, semantics.home_pose(chain).values)
+    model, of_parser = build(urdf, root, chain, followers)
     xml = ElementTree.tostring(root, encoding="unicode")
-    model = build(urdf, xml)
     geometry, shapes = read_geometry(
         urdf, xml, model, "collision", options.package_dirs, convex_hulls=options.convex_hulls
     )
@@ -120,7 +124,8 @@ def _build(
         modules=modules,
         xml=xml,
         ee_frame=ee_frame,
-        joint_names=tuple(model.names)[1:],
+        joint_names=chain,
+        followers=tuple(sorted(followers, key=lambda follower: model.getJointId(follower.name))),
         lower=read_only(model.lowerPositionLimit),
         upper=read_only(model.upperPositionLimit),
         velocity_limit=read_only(model.velocityLimit),
@@ -133,7 +138,7 @@ def _build(
         geometry=geometry,
         shapes=shapes,
         options=options,
-        findings=tuple(empty),
+        findings=(*empty, *of_parser),
     )
 
 

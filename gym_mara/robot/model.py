@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,13 +13,15 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers
-from gym_mara.robot import bounds, catalog
+from gym_mara.robot import catalog
+from gym_mara.robot.bounds import Bounds
 from gym_mara.robot.collision_pairs import Pair, link_of
+from gym_mara.robot.description.off_chain import Follower
 from gym_mara.robot.description.shapes import Shape
 from gym_mara.robot.description.target import Target
 from gym_mara.robot.diagnosis import Finding, raise_errors, warn
 from gym_mara.robot.geometry import Geometry, read_geometry
-from gym_mara.robot.kinematics import Kinematics
+from gym_mara.robot.kinematics import Kinematics, motion_axis
 from gym_mara.robot.loading import from_files, from_modules, read_only, with_notes
 from gym_mara.robot.options import RobotOptions
 from gym_mara.types import Floats
@@ -41,6 +44,8 @@ class RobotModel:
     """The URDF as text, with all joints off the chain fixed."""
     ee_frame: str
     joint_names: tuple[str, ...]
+    followers: tuple[Follower, ...]
+    """The joints off the chain that mimic one of it; in `model` they come after the chain, in this order."""
     lower: Floats
     """Lower position limits, rad (m for a prismatic joint)."""
     upper: Floats
@@ -119,6 +124,10 @@ class RobotModel:
             srdf = path.with_suffix(".srdf")
             srdf_there = srdf if srdf.is_file() else None
             return from_files(cls, path, ee_frame, srdf_there, None, own)
+        if robot not in catalog.robot_names() and robot and os.path.lexists(robot):
+            raise GymMaraError(
+                f"robot={robot!r} is no robot's name; for the file of that name write {os.path.join('.', robot)!r}"
+            )
         files = catalog.find(robot)
         frame = ee_frame or files.ee_frame
         found = from_files(cls, files.urdf, frame, files.srdf, robot, own)
@@ -201,6 +210,17 @@ class RobotModel:
         """
         raise_errors(self.name, self.findings, dynamics=True)
 
+    def motion(self, number: int) -> Floats:
+        """The motion subspace (6,) of a joint of `model`, in its own frame: linear part, then angular.
+
+        Args:
+            number: Pinocchio's index of the joint, from 1.
+        """
+        motion = motion_axis(self.model.joints[number])
+        if number > self.num_joints:  # Pinocchio gives it per unit of the leader
+            motion = motion / self.followers[number - 1 - self.num_joints].multiplier
+        return motion
+
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""
         return Kinematics(self.model, self.ee_frame_id)
@@ -208,12 +228,17 @@ class RobotModel:
     @cached_property
     def reach(self) -> Floats:
         """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or 1 if prismatic."""
-        return read_only(bounds.reach(self))
+        return read_only(self.bounds.reach)
 
-    @cached_property
+    @property
     def extent(self) -> float:
         """A bound on how far any point of the arm can be from the world's origin, m."""
-        return bounds.extent(self)
+        return self.bounds.extent
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """How far the joints move the arm's points."""
+        return Bounds.of(self.model, self.geometry, self.ee_frame_id, self.followers)
 
     def link_of(self, geometry_index: int) -> str:
         """The name of the link that a collision shape belongs to, given the shape's index."""
@@ -259,7 +284,10 @@ class RobotModel:
 
 def is_path(robot: object) -> TypeGuard[str | Path]:
     """Whether a robot is given by the path of its URDF."""
-    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))
+    if isinstance(robot, str):
+        name = robot.lower()
+        return name.endswith((".urdf", ".xml", ".xacro")) or os.sep in name or "/" in name
+    return isinstance(robot, Path)
 
 
 RobotLike = str | Sequence[str] | RobotModel

@@ -59,11 +59,12 @@ def test_a_continuous_joint_needs_no_limit(tmp_path: Path) -> None:
     assert (robot.lower[0], robot.upper[0]) == (-np.pi, np.pi)
 
 
-def test_joints_off_the_chain_are_locked(tmp_path: Path) -> None:
-    finger = joint_xml(2, "prismatic", extra='<mimic joint="joint1"/>')
-    robot = _load(tmp_path, urdf_xml(joint_xml(0), joint_xml(1), finger))
-    assert robot.joint_names == ("joint0", "joint1")
-    assert any("link3" in pair for pair in robot.collision_pairs), "the finger still collides"
+def test_links_off_the_chain_collide(tmp_path: Path) -> None:
+    for mimic in ("", '<mimic joint="joint1"/>'):
+        finger = joint_xml(2, "prismatic", extra=mimic)
+        robot = _load(tmp_path, urdf_xml(joint_xml(0), joint_xml(1), finger))
+        assert robot.joint_names == ("joint0", "joint1")
+        assert any("link3" in pair for pair in robot.collision_pairs)
 
 
 def test_an_srdf_beside_the_urdf_says_pose_end_effector_and_pairs(tmp_path: Path) -> None:
@@ -218,7 +219,7 @@ def test_a_missing_urdf(tmp_path: Path) -> None:
         pytest.param(
             urdf_xml(joint_xml(0), joint_xml(1, extra='<mimic joint="joint0"/>')),
             "link2",
-            "joint 'joint1' is mimic",
+            "joint 'joint1', which leads to 'link2', mimics 'joint0'; only joints off the chain may",
             id="mimic",
         ),
         pytest.param(
@@ -230,13 +231,13 @@ def test_a_missing_urdf(tmp_path: Path) -> None:
         pytest.param(
             urdf_xml(joint_xml(0).replace('<parent link="link0"/>', ""), joint_xml(1)),
             "link2",
-            "joint 'joint0' lacks a parent or child",
+            "joint 'joint0' has no <parent>",
             id="joint without parent",
         ),
         pytest.param(
             urdf_xml(joint_xml(0, limit=""), joint_xml(1)),
             "link2",
-            r"cannot load the URDF .*stick\.urdf",
+            r"stick\.urdf.*joint 'joint0' is revolute and has no <limit>",
             id="no limit",
         ),
     ],

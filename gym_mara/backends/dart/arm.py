@@ -13,7 +13,6 @@ from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
-from gym_mara.robot.kinematics import motion_axis
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -25,7 +24,7 @@ GRAVITY = 9.81
 LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
 # DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
-_NO_MASS = 1e-9
+_NO_INERTIA = pin.Inertia(1e-9, np.zeros(3), 1e-9 * np.eye(3))
 _REACHED = 1e-6
 """A joint this close to its commanded velocity, rad/s (m/s), has reached it; DART is accurate to 1e-8."""
 
@@ -59,7 +58,8 @@ class DartArm:
         self.physics_step = physics_step
         self.skeleton = dart.dynamics.Skeleton(robot.name)
         self.bodies = self._build_bodies()
-        self._joints = [body.getParentJoint() for body in self.bodies[1:]]
+        joints = [body.getParentJoint() for body in self.bodies[1:]]
+        self._joints, followers = joints[: robot.num_joints], joints[robot.num_joints :]
         speed = robot.velocity_limit if velocity_limit is None else velocity_limit
         if servo:
             for joint, low, high in zip(self._joints, robot.lower, robot.upper, strict=True):
@@ -68,6 +68,10 @@ class DartArm:
                 joint.setPositionUpperLimit(0, high)
                 joint.setLimitEnforcement(True)
             self.set_parameters()
+        # They are driven along: contacts do not hold them back, nor act on the joints that they mimic.
+        for joint in followers:
+            joint.setActuatorType(dart.dynamics.VELOCITY)
+        self._command = self._command_all if followers else self.skeleton.setCommands
         self._detector: Detector | None = None
         if detector is not None:
             self._detector = like._detector if like else Detector(detector, robot)
@@ -95,7 +99,7 @@ class DartArm:
         bodies = [self.skeleton.createWeldJointAndBodyNodePair()[1]]
         _set_inertia(bodies[0], pin.Inertia(1.0, np.zeros(3), np.eye(3)))
         for number in range(1, model.njoints):
-            linear, angular = np.split(motion_axis(model.joints[number]), 2)
+            linear, angular = np.split(self.robot.motion(number), 2)
             parent = bodies[model.parents[number]]
             if angular.any():
                 properties = dart.dynamics.RevoluteJointProperties()
@@ -107,8 +111,12 @@ class DartArm:
             properties.mAxis = angular if angular.any() else linear
             properties.mT_ParentBodyToJoint = _isometry(model.jointPlacements[number])
             joint, body = create(properties)
-            joint.setDampingCoefficient(0, model.damping[number - 1])
-            _set_inertia(body, model.inertias[number])
+            inertia = model.inertias[number]
+            if number <= self.robot.num_joints:
+                joint.setDampingCoefficient(0, model.damping[number - 1])
+            elif inertia.mass <= 0.0:
+                inertia = _NO_INERTIA
+            _set_inertia(body, inertia)
             bodies.append(body)
         return bodies
 
@@ -125,7 +133,7 @@ class DartArm:
                 body = unnamed.pop(number, None)
                 if body is None:
                     body = self.bodies[number].createWeldJointAndBodyNodePair()[1]
-                    _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
+                    _set_inertia(body, _NO_INERTIA)
                 body.setName(link)
                 links[link] = body
             for shape, placement in self._detector.shapes[index]:
@@ -178,7 +186,9 @@ class DartArm:
         friction = model.friction if joint_friction is None else joint_friction
         self._effort = effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
         mass, friction = np.broadcast_to(mass, count), np.broadcast_to(friction, count)
-        for index, (joint, body) in enumerate(zip(self._joints, self.bodies[1:], strict=True)):
+        for index, (joint, body) in enumerate(
+            zip(self._joints, self.bodies[1 : 1 + count], strict=True)
+        ):
             joint.setForceLowerLimit(0, -effort[index])
             joint.setForceUpperLimit(0, effort[index])
             joint.setCoulombFriction(0, friction[index])
@@ -195,8 +205,9 @@ class DartArm:
 
     def set_state(self, q: Floats, qd: Floats) -> None:
         """Put the arm at q, rad, with velocities qd, rad/s; both (J,)."""
-        self.skeleton.setPositions(q)
-        self.skeleton.setVelocities(qd)
+        followers = self.robot.followers
+        self.skeleton.setPositions(np.append(q, [each.position(q) for each in followers]))
+        self.skeleton.setVelocities(np.append(qd, [each.velocity(qd) for each in followers]))
         self.skeleton.resetAccelerations()
         self.skeleton.resetCommands()
         self.skeleton.clearConstraintImpulses()
@@ -204,19 +215,31 @@ class DartArm:
     @property
     def q(self) -> Floats:
         """Joint positions (J,), rad."""
-        return np.asarray(self.skeleton.getPositions())
+        return np.asarray(self.skeleton.getPositions())[: self.robot.num_joints]
 
     @property
     def qd(self) -> Floats:
         """Joint velocities (J,), rad/s."""
-        return np.asarray(self.skeleton.getVelocities())
+        return np.asarray(self.skeleton.getVelocities())[: self.robot.num_joints]
+
+    @property
+    def followers(self) -> Floats:
+        """Positions and velocities of the joints that follow others (2, F), rad and rad/s; they lag in a jam."""
+        state = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        return np.array(state)[:, self.robot.num_joints :]
+
+    @followers.setter
+    def followers(self, state: Floats) -> None:
+        for index, (q, qd) in enumerate(state.T.tolist(), self.robot.num_joints):
+            self.skeleton.setPosition(index, q)
+            self.skeleton.setVelocity(index, qd)
 
     @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
         # DART adds what end stops and contacts exert. A motor that does not reach its commanded velocity exerts all it can.
         effort, missing = self._effort, self._commanded - self.qd
-        forces = np.clip(self.skeleton.getConstraintForces(), -effort, effort)
+        forces = np.clip(self.skeleton.getConstraintForces()[: len(effort)], -effort, effort)
         return np.where(np.abs(missing) > _REACHED, np.copysign(effort, missing), forces)
 
     def run(self, velocities: Floats) -> tuple[Contact, ...]:
@@ -235,11 +258,21 @@ class DartArm:
                     break
                 self._run_with_contacts(block, deepest)
             else:
-                command, step = self.skeleton.setCommands, self._free_world.step
+                command, step = self._command, self._free_world.step
                 for velocity in block:
                     command(velocity)
                     step()
         return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
+
+    def _command_all(self, velocities: Floats) -> None:
+        """Command the velocities of the motors (J,), rad/s, for one physics step, and those of the joints that follow."""
+        count, step = self.robot.num_joints, self.physics_step
+        q = self.skeleton.getPositions()
+        after = q[:count] + step * velocities
+        wanted = [each.position(after) for each in self.robot.followers]
+        speed = [abs(each.velocity(self._fastest)) for each in self.robot.followers]
+        follow = np.clip((wanted - q[count:]) / step, np.negative(speed), speed)
+        self.skeleton.setCommands(np.append(velocities, follow))
 
     def contacts(self) -> tuple[Contact, ...]:
         """The contacts at the current state."""
@@ -249,7 +282,7 @@ class DartArm:
 
     def may_touch(self) -> bool:
         """Whether any links could touch within the next block of steps."""
-        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        q, qd = self.q, self.qd
         slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
         return bool(not slow or self._clearance.check(q[None])[0])
 
@@ -259,7 +292,7 @@ class DartArm:
         group = self.world.getConstraintSolver().getCollisionGroup()
         group.removeAllShapeFrames()
         group.addShapeFramesOf(self.skeleton)
-        command, step = self.skeleton.setCommands, self.world.step
+        command, step = self._command, self.world.step
         result = self.world.getLastCollisionResult
         for velocity in velocities:
             command(velocity)

@@ -22,10 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gym_mara.errors import GymMaraError
-from gym_mara.files import LARGEST_TEXT, read_bytes
-
-_DEEPEST = 100
-"""Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
+from gym_mara.robot.description.xml_files import read_xml
 
 
 class Pose(NamedTuple):
@@ -58,16 +55,19 @@ class Semantics:
         Raises:
             GymMaraError: the pose gives one of the joints several values, or none.
         """
-        for pose, values in self.poses:
-            if all(joint in values for joint in joints):
-                for joint in joints:
-                    if len(values[joint]) != 1:
-                        raise GymMaraError(
-                            f"the SRDF's pose {pose!r} gives joint {joint!r} {len(values[joint])} values; "
-                            "a revolute or prismatic joint has one"
-                        )
-                return [values[joint][0] for joint in joints]
-        return [0.0] * len(joints)
+        pose, values = self.home_pose(joints)
+        for joint in joints:
+            if len(values.get(joint, (0.0,))) != 1:
+                raise GymMaraError(
+                    f"the SRDF's pose {pose!r} gives joint {joint!r} {len(values[joint])} values; "
+                    "a revolute or prismatic joint has one"
+                )
+        return [values.get(joint, (0.0,))[0] for joint in joints]
+
+    def home_pose(self, joints: Sequence[str]) -> Pose:
+        """The first pose that names every one of these joints; without values if there is none."""
+        fitting = (pose for pose in self.poses if all(joint in pose.values for joint in joints))
+        return next(fitting, Pose("", {}))
 
     @property
     def names(self) -> frozenset[str]:
@@ -141,31 +141,3 @@ def _position(path: Path, joint: ElementTree.Element) -> tuple[float, ...]:
             "a joint's value must be a finite number, rad (m for a prismatic joint)"
         )
     return position
-
-
-def read_xml(path: Path, kind: str) -> ElementTree.Element:
-    """The root of an XML file whose root element is `<robot>`.
-
-    Raises:
-        GymMaraError: the file is missing, is not XML, or describes no robot.
-    """
-    content = read_bytes(path, LARGEST_TEXT)
-    try:
-        root = ElementTree.fromstring(content)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
-        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
-    if _depth(root) > _DEEPEST:
-        raise GymMaraError(
-            f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
-        )
-    if root.tag != "robot":
-        raise GymMaraError(f"{str(path)!r} is not a {kind}: its root is <{root.tag}>, not <robot>")
-    return root
-
-
-def _depth(root: ElementTree.Element) -> int:
-    """How deep the elements are nested; at most one more than allowed."""
-    level, depth = [root], 0
-    while level and depth <= _DEEPEST:
-        level, depth = [child for element in level for child in element], depth + 1
-    return depth
