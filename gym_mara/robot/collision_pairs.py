@@ -36,7 +36,8 @@ def set_collision_pairs(
 ) -> Pairs:
     """Set the collision pairs of a geometry.
 
-    Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables pairs.
+    Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables pairs
+    of this robot.
 
     Args:
         root: the URDF.
@@ -53,7 +54,7 @@ def set_collision_pairs(
         elif pair in neighbours:
             excluded[pair] = NEIGHBOURS
     keep_pairs(model, geometry, set(linked(model, geometry)) - excluded.keys())
-    if DISABLED not in excluded.values():
+    if not semantics.disables_any(root):
         touching = touching_pairs(model, geometry, home)
         excluded |= dict.fromkeys(touching, AT_HOME)
         keep_pairs(model, geometry, set(linked(model, geometry)) - touching)

@@ -71,7 +71,8 @@ def _arm(folder: Path, shape: str) -> RobotModel:
             f'<parent link="l{number - 1}"/><child link="l{number}"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>'
             '<limit lower="-2.6" upper="2.6" effort="9" velocity="1"/></joint>'
         )
-    return RobotModel.from_urdf(write(folder / "arm.urdf", f'<robot name="a">{text}</robot>'), "l3")
+    path = write(folder / "arm.urdf", f'<robot name="a">{text}</robot>')
+    return RobotModel.inspect(path, "l3", default_mass=1.0)
 
 
 @pytest.mark.parametrize("engine", ["coal", *ENGINES])

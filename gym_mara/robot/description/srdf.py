@@ -85,6 +85,11 @@ class Semantics:
             pair not in self.enabled and bool(pair & self.disabled_links)
         )
 
+    def disables_any(self, root: ElementTree.Element) -> bool:
+        """Whether pairs of links of a URDF are disabled."""
+        links = {link.get("name", "") for link in root.findall("link")}
+        return bool(self.disabled_links & links) or any(pair <= links for pair in self.disabled)
+
 
 def read_srdf(path: Path) -> Semantics:
     """Read an SRDF file.

@@ -77,8 +77,8 @@ def _joints(robot: RobotModel) -> Iterator[Finding]:
 
 
 def _bodies(robot: RobotModel, which: Callable[[int, pin.Inertia], bool]) -> list[str]:
-    """The links that joints move, of the bodies for which a function of their number and inertia is true."""
-    numbers = range(1, robot.model.njoints)
+    """The links that the chain's joints move, of the bodies for which a function of their number and inertia is true."""
+    numbers = range(1, robot.num_joints + 1)
     return [body_name(robot, n) for n in numbers if which(n, robot.model.inertias[n])]
 
 
