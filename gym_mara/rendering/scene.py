@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,7 +81,9 @@ class Scene:
                 parts.append(_part(name, link, mesh, colour, fixed=placed.parentJoint == 0))
                 self._geometry_index.append(index)
         self._num_bodies = len(parts)
-        parts += _frame("target", 0.14, 0.006) + _frame("tool", 0.09, 0.003)
+        scale = _marker_scale(robot)
+        parts += _frame("target", 0.14 * scale, 0.006 * scale)
+        parts += _frame("tool", 0.09 * scale, 0.003 * scale)
         self.parts: tuple[Part, ...] = tuple(parts)
 
     def placements(self, view: View) -> Floats:
@@ -107,6 +110,34 @@ class Scene:
         """The vertices of all parts in the world frame (V, 3), m."""
         pairs = zip(self.parts, self.placements(view), strict=True)
         return np.concatenate([part.placed(placement) for part, placement in pairs], dtype=float)
+
+    def swept(self, q: Floats) -> Floats:
+        """Where the arm is at configurations (N, J): the corners of boxes around its moving bodies (V, 3), m, in the world frame."""
+        vertices: dict[int, list[NDArray[np.float32]]] = {}
+        for part, index in zip(self.parts, self._geometry_index, strict=False):
+            placed = self._geometry.geometryObjects[index]
+            if not part.fixed:
+                own = part.placed(placed.placement.homogeneous)
+                vertices.setdefault(placed.parentJoint - 1, []).append(own)
+        if not vertices:
+            return np.empty((0, 3))
+        bodies = sorted(vertices, reverse=True)
+        boxes = [_corners(np.concatenate(vertices[body])) for body in bodies]
+        of_corners = np.repeat(bodies, 8).tolist()
+        points = self.robot.kinematics().points(q, of_corners, np.concatenate(boxes))
+        return points.reshape(-1, 3)
+
+
+def _corners(points: NDArray[np.float32]) -> Floats:
+    """The corners (8, 3) of the box around points (V, 3), along the axes."""
+    ends = np.array([points.min(axis=0), points.max(axis=0)], float)
+    return np.array(list(itertools.product(*ends.T)))
+
+
+def _marker_scale(robot: RobotModel) -> float:
+    """The size of the markers relative to those of MARA, which is 1.2 m long; to two digits, so that MARA's is 1."""
+    turning = robot.reach[~robot.kinematics().prismatic]
+    return float(f"{(turning.max() if len(turning) else robot.extent) / 1.2:.2g}")
 
 
 def _meshes_of(placed: pin.GeometryObject, shape: Shape) -> list[tuple[trimesh.Trimesh, Colour]]:
