@@ -14,6 +14,10 @@ _DEEPEST = 100
 """Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
 _OF_OTHERS = ("gazebo", "transmission", "ros2_control")
 """Elements for other programs."""
+_XACRO = re.compile(r"\{[^}]*xacro[^}]*\}")
+"""The namespace of xacro's elements."""
+_DEFINES = re.compile(_XACRO.pattern + "(property|arg)$")
+"""Elements of xacro that change nothing by themselves: what uses them has ${…} or $(arg …)."""
 
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
@@ -55,11 +59,11 @@ def _urdfs_in(folder: Path) -> str:
 def _xacro_in(root: ElementTree.Element) -> str:
     """What shows that a file was not expanded by xacro; empty if nothing does."""
     for part in root:
-        if part.tag in _OF_OTHERS:
+        if part.tag in _OF_OTHERS or _DEFINES.match(str(part.tag)):
             continue
         for element in part.iter():
             tag = str(element.tag)
-            if re.match(r"\{[^}]*xacro[^}]*\}", tag):
+            if _XACRO.match(tag):
                 return f"it has an element <xacro:{tag.rpartition('}')[2]}>"
             for name, value in element.items():
                 if "${" in value or "$(" in value:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,18 @@ def test_xacro_is_answered_by_how_to_expand_it(
 ) -> None:
     with pytest.raises(GymMaraError, match=message):
         RobotModel.load(str(write(tmp_path / name, text)), "tool")
+
+
+def test_definitions_that_nothing_uses_do_not_make_a_template(tmp_path: Path) -> None:
+    definitions = '<xacro:property name="width" value="0.2"/><xacro:arg name="size" default="2"/>'
+    text = upright_arm().replace(
+        '<robot name="upright">',
+        f'<robot name="upright" xmlns:xacro="http://www.ros.org/wiki/xacro">{definitions}',
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        robot = RobotModel.load(write(tmp_path / "arm.urdf", text), "tool")
+    assert robot.num_joints == 3
 
 
 @pytest.mark.parametrize(
