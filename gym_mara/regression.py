@@ -26,7 +26,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
 from gym_mara.robot.inverse_kinematics import solve_ik
-from gym_mara.robot.keywords import ROBOT_KEYWORDS, with_paths
+from gym_mara.robot.options import ROBOT_KEYWORDS, with_paths
 from gym_mara.types import Floats
 
 MOST_STATES = 100_000
