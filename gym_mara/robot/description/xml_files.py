@@ -34,7 +34,8 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
         if "unbound prefix" in str(error) and b"<xacro:" in content:
             raise _not_expanded(path, kind, "it has elements <xacro:…>") from None
-        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
+        line = _line_of(error, content)
+        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}{line}") from error
     if _depth(root) > _DEEPEST:
         raise GymMaraError(
             f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
@@ -44,6 +45,14 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     if residue := _xacro_in(root):
         raise _not_expanded(path, kind, residue)
     return root
+
+
+def _line_of(error: Exception, content: bytes) -> str:
+    """The line of a file where the parser stopped, for an error; empty if it has no text."""
+    number, _ = getattr(error, "position", (0, 0))
+    line = content.splitlines()[number - 1 : number]
+    text = line[0].decode(errors="replace").strip() if line else ""
+    return f": {short(text)}" if text else ""
 
 
 def _urdfs_in(folder: Path) -> str:

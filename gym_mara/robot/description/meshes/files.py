@@ -29,15 +29,15 @@ def mesh_file(urdf: Path, name: str, package_dirs: Sequence[str]) -> Path:
     rest = f" and {len(places) - _SHOWN} more places" if len(places) > _SHOWN else ""
     raise GymMaraError(
         f"the mesh {name!r} of {str(urdf)!r} is not found; it was looked for at {', '.join(shown)}{rest}. "
-        "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"
+        f"{_advice(name, places)}"
     )
 
 
 def candidates(urdf: Path, name: str, package_dirs: Sequence[str]) -> list[Path]:
     """The places where a mesh may be, the first one first."""
-    scheme, _, rest = name.rpartition("://")
+    _, _, rest = name.rpartition("://")
     own = urdf.absolute().parent
-    if scheme == "file" or (not scheme and Path(rest).is_absolute()):
+    if _is_absolute(name):
         return [Path(rest)]
     given = [Path(folder).absolute() for folder in package_dirs]
     ros = [
@@ -48,6 +48,40 @@ def candidates(urdf: Path, name: str, package_dirs: Sequence[str]) -> list[Path]
     ]
     _, _, inside = rest.partition("/")
     # package_dirs may name the package's own folder, whatever its name is.
-    renamed = [folder / inside for folder in given] if scheme else []
+    renamed = [folder / inside for folder in given] if "://" in name else []
     folders = [*given, own, *own.parents, *ros]
     return list(dict.fromkeys([*(folder / rest for folder in folders), *renamed]))
+
+
+def _is_absolute(name: str) -> bool:
+    scheme, _, rest = name.rpartition("://")
+    return scheme == "file" or (not scheme and Path(rest).is_absolute())
+
+
+def _advice(name: str, places: Sequence[Path]) -> str:
+    """What to do about a mesh that is at none of these places."""
+    for place in places:
+        if similar := _in_other_case(place):
+            return f"There is {str(similar)!r}: write its name in the same letter case"
+    if "\\" in name:
+        return "Write '/' between folders, not '\\'"
+    if _is_absolute(name):
+        return "A path of another machine must be changed in the URDF, to package://PACKAGE/PATH or a path beside the URDF"
+    return "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"
+
+
+def _in_other_case(place: Path) -> Path | None:
+    """The file whose path differs by its letter case only."""
+    found = Path(place.anchor)
+    for part in place.parts[1:]:
+        if not os.path.lexists(found / part):
+            try:
+                names = os.listdir(found)
+            except OSError:
+                return None
+            same = (name for name in names if name.lower() == part.lower())
+            if (other := next(same, None)) is None:
+                return None
+            part = other
+        found /= part
+    return found
