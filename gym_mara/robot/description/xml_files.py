@@ -14,6 +14,8 @@ _DEEPEST = 100
 """Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
 _OF_OTHERS = ("gazebo", "transmission", "ros2_control")
 """Elements for other programs."""
+_DEFINED = ("property", "arg")
+"""Elements of xacro that only define values: where no value is used, nothing is to be expanded."""
 
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
@@ -68,8 +70,9 @@ def _xacro_in(root: ElementTree.Element) -> str:
             continue
         for element in part.iter():
             tag = str(element.tag)
-            if re.match(r"\{[^}]*xacro[^}]*\}", tag):
-                return f"it has an element <xacro:{tag.rpartition('}')[2]}>"
+            own = re.match(r"\{[^}]*xacro[^}]*\}(.*)", tag)
+            if own and own[1] not in _DEFINED:
+                return f"it has an element <xacro:{own[1]}>"
             for name, value in element.items():
                 if "${" in value or "$(" in value:
                     return f"<{tag}> has {name}={short(value)}"

@@ -32,6 +32,20 @@ def test_xacro_is_answered_by_how_to_expand_it(
         RobotModel.load(str(write(tmp_path / name, text)), "tool")
 
 
+@pytest.mark.parametrize("used", ["", "${width}"])
+def test_a_property_of_xacro_that_is_not_used_is_no_template(tmp_path: Path, used: str) -> None:
+    element = '<xacro:property name="width" value=".2"/><xacro:arg name="a" default="1"/>'
+    text = re.sub(
+        "<robot[^>]*>", f'<robot name="{used}" xmlns:xacro="xacro">{element}', upright_arm()
+    )
+    urdf = write(tmp_path / "arm.urdf", text.replace('upper="2"', f'upper="{used or 2}"'))
+    if used:
+        with pytest.raises(GymMaraError, match=r"<limit> has upper='\${width}'"):
+            RobotModel.load(urdf, "tool")
+    else:
+        assert RobotModel.load(urdf, "tool").num_joints == 3
+
+
 @pytest.mark.parametrize(
     ("joint", "message"),
     [

@@ -67,7 +67,20 @@ def _advice(name: str, places: Sequence[Path]) -> str:
         return "Write '/' between folders, not '\\'"
     if _is_absolute(name):
         return "A path of another machine must be changed in the URDF, to package://PACKAGE/PATH or a path beside the URDF"
+    if packages := _packages(name, places):
+        return f"The package is in {', '.join(map(repr, packages))}, without this file: add the file, or correct its name"
     return "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"
+
+
+def _packages(name: str, places: Sequence[Path]) -> list[str]:
+    """The folders of the package of package://PACKAGE/PATH that exist."""
+    _, _, rest = name.rpartition("://")
+    package, inside = rest.partition("/")[::2]
+    depth = len(Path(inside).parts)
+    found = {str(place.parents[depth - 1]) for place in places if "://" in name and depth}
+    return sorted(
+        folder for folder in found if Path(folder).name == package and Path(folder).is_dir()
+    )
 
 
 def _in_other_case(place: Path) -> Path | None:

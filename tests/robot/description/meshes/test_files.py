@@ -43,3 +43,11 @@ def test_windows_separators_are_named(tmp_path: Path) -> None:
     _file(tmp_path / "meshes" / "link.stl")
     with pytest.raises(GymMaraError, match="Write '/' between folders"):
         mesh_file(tmp_path / "arm.urdf", "meshes\\link.stl", ())
+
+
+def test_a_package_without_the_file_is_named(tmp_path: Path) -> None:
+    there = _file(tmp_path / "arm" / "meshes" / "other.stl").parents[1]
+    for name in ("package://arm/meshes/link.stl", "package://arm/link.stl"):
+        with pytest.raises(GymMaraError, match="without this file: add the file") as raised:
+            mesh_file(tmp_path / "arm.urdf", name, ())
+        assert repr(str(there)) in str(raised.value)
