@@ -16,7 +16,7 @@ import coal
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.description.mesh_files import mesh_file
+from gym_mara.robot.description.meshes.files import mesh_file
 from gym_mara.robot.description.parser import parsing
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
@@ -89,7 +89,9 @@ def read_geometry(
 def _mesh(
     urdf: Path, element: ElementTree.Element, convex: bool, package_dirs: Sequence[str]
 ) -> Mesh:
-    from gym_mara.robot.description.meshes import read_mesh  # most robots here have no meshes
+    from gym_mara.robot.description.meshes.reader import (
+        read_mesh,
+    )  # most robots here have no meshes
 
     x, y, z = map(float, element.get("scale", "1 1 1").split())
     path = mesh_file(urdf, element.get("filename", ""), package_dirs)

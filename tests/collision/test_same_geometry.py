@@ -15,7 +15,7 @@ from gym_mara.rendering.scene import Scene
 from gym_mara.robot import RobotModel
 from gym_mara.testing import uniform_q
 from tests.helpers import Floats, Mask, write
-from tests.robot.description.test_meshes import TWO_PARTS, dae
+from tests.robot.description.meshes.test_reader import TWO_PARTS, dae
 from tests.shape_pairs import PRIMITIVES, held, wrong
 
 ENGINES = ("fcl", "dart with fcl", "dart with dart")

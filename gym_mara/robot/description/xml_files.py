@@ -14,6 +14,8 @@ _DEEPEST = 100
 """Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
 _OF_OTHERS = ("gazebo", "transmission", "ros2_control")
 """Elements for other programs."""
+_DEFINED = ("property", "arg")
+"""Elements of xacro that only define values: where no value is used, nothing is to be expanded."""
 
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
@@ -34,7 +36,8 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
         if "unbound prefix" in str(error) and b"<xacro:" in content:
             raise _not_expanded(path, kind, "it has elements <xacro:…>") from None
-        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
+        line = _line_of(error, content)
+        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}{line}") from error
     if _depth(root) > _DEEPEST:
         raise GymMaraError(
             f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
@@ -44,6 +47,14 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     if residue := _xacro_in(root):
         raise _not_expanded(path, kind, residue)
     return root
+
+
+def _line_of(error: Exception, content: bytes) -> str:
+    """The line of a file where the parser stopped, for an error; empty if it has no text."""
+    number, _ = getattr(error, "position", (0, 0))
+    line = content.splitlines()[number - 1 : number]
+    text = line[0].decode(errors="replace").strip() if line else ""
+    return f": {short(text)}" if text else ""
 
 
 def _urdfs_in(folder: Path) -> str:
@@ -59,8 +70,9 @@ def _xacro_in(root: ElementTree.Element) -> str:
             continue
         for element in part.iter():
             tag = str(element.tag)
-            if re.match(r"\{[^}]*xacro[^}]*\}", tag):
-                return f"it has an element <xacro:{tag.rpartition('}')[2]}>"
+            own = re.match(r"\{[^}]*xacro[^}]*\}(.*)", tag)
+            if own and own[1] not in _DEFINED:
+                return f"it has an element <xacro:{own[1]}>"
             for name, value in element.items():
                 if "${" in value or "$(" in value:
                     return f"<{tag}> has {name}={short(value)}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,21 +12,30 @@ import trimesh
 
 from gym_mara.errors import GymMaraError
 from gym_mara.files import plain_size
-from gym_mara.robot.description.mesh_checks import check_dae, check_obj, check_ply
+from gym_mara.robot.description.meshes.checks import Checked, check_obj, check_ply
+from gym_mara.robot.description.meshes.collada_file import check_dae
+from gym_mara.robot.description.meshes.gltf_file import check_gltf
 from gym_mara.robot.description.shapes import Mesh
 
 _KEPT = 256
 """The number of meshes that are kept for the next robot."""
-FORMATS = (".dae", ".obj", ".ply", ".stl")
-_CHECKS = {".dae": check_dae, ".obj": check_obj, ".ply": check_ply}
+_CHECKS: dict[str, Callable[[Path], Checked]] = {
+    ".dae": check_dae,
+    ".glb": check_gltf,
+    ".gltf": check_gltf,
+    ".obj": check_obj,
+    ".ply": check_ply,
+    ".stl": lambda path: Checked(),
+}
 """What trimesh does not check: it drops what it cannot read of such a file."""
+FORMATS = tuple(_CHECKS)
 
 
 def read_mesh(path: Path, scale: tuple[float, float, float], *, convex: bool) -> Mesh:
     """The mesh of a file, or its convex hull.
 
     The axes are those of the file: like RViz, Gazebo and MoveIt, this ignores the up-axis of a Collada file, because robots
-    are published so that they look right there. A negative scale mirrors the mesh; its triangles still face outwards.
+    are published so that they look right there. Only glTF's y, which points up, becomes z, as in RViz. A negative scale mirrors the mesh; its triangles still face outwards.
 
     Args:
         path: the file, in one of `FORMATS`.
@@ -50,19 +61,24 @@ def _scaled(
 @lru_cache(maxsize=_KEPT)
 def _parts(path: Path, version: tuple[int, int]) -> tuple[trimesh.Trimesh, ...]:
     """The parts of a mesh file in the file's frame, m."""
-    if path.suffix.lower() not in FORMATS:
+    kind = path.suffix.lower()
+    if kind not in _CHECKS:
         raise GymMaraError(
             f"the mesh {str(path)!r} has an unknown format; supported are {', '.join(FORMATS)}"
         )
-    metre = 1.0
     try:
-        if check := _CHECKS.get(path.suffix.lower()):
-            metre = check(path)
-        # trimesh's processing would drop a vertex that is not finite, and its triangles.
-        found = trimesh.load_scene(path, process=False).dump()
+        checked = _CHECKS[kind](path)
+        found = _read(path, kind, checked)
     except Exception as error:  # the readers of the formats raise whatever their parsers do
-        raise GymMaraError(f"the mesh {str(path)!r} cannot be read: {error}") from error
+        reason = str(error) or type(error).__name__
+        raise GymMaraError(f"the mesh {str(path)!r} cannot be read: {reason}") from error
     parts = tuple(p for p in found if isinstance(p, trimesh.Trimesh) and len(p.faces))
+    triangles = sum(len(part.faces) for part in parts)
+    if checked.triangles not in (None, triangles):
+        raise GymMaraError(
+            f"the mesh {str(path)!r} has {checked.triangles:,} triangles, of which {triangles:,} can be read; "
+            "export it as .stl or .obj"
+        )
     if not parts:
         raise GymMaraError(f"the mesh {str(path)!r} has no triangles, or is cut off")
     for part in parts:
@@ -71,5 +87,20 @@ def _parts(path: Path, version: tuple[int, int]) -> tuple[trimesh.Trimesh, ...]:
         if not np.isfinite(part.vertices).all():
             raise GymMaraError(f"the mesh {str(path)!r} has a vertex that is not finite")
         part.process()
-        part.apply_scale(metre)
+        if checked.frame is not None:
+            part.apply_transform(checked.frame)
     return parts
+
+
+def _read(path: Path, kind: str, checked: Checked) -> list[trimesh.Trimesh]:
+    """What trimesh finds in a file that was checked."""
+    source = path if checked.content is None else io.BytesIO(checked.content)
+    # trimesh's processing would drop a vertex that is not finite, and its triangles.
+    options = (
+        {"process": False}
+        if checked.others is None
+        else {"process": False, "resolver": checked.others}
+    )
+    scene = trimesh.load_scene(source, file_type=kind[1:], **options)
+    found: list[trimesh.Trimesh] = scene.dump()
+    return found
