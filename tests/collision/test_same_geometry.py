@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -153,6 +154,33 @@ def test_the_second_part_of_a_mesh_touches_a_post(folder: Path, engine: str) -> 
     before = (corners[..., 0] < POST[0, 0] - 0.25).all(axis=1)
     assert _check(engine, robot, q[inside][:60]).sum() == 60
     assert _check(engine, robot, q[before][:60]).sum() == 0
+
+
+CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 0.2) for y in (0, 0.2) for z in (0, 0.2))
+QUADS = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+POOR = {
+    "open": QUADS[1:],
+    "repeated": (*QUADS, *QUADS),
+    "inside out": [" ".join(reversed(quad.split())) for quad in QUADS],
+    "degenerate": (*QUADS, "1 1 2", "1 1 1", "1 8 8"),
+    "flat": QUADS[:1],
+    "one triangle": ("1 2 3",),
+}
+"""The faces of meshes that are not the surface of a body."""
+
+
+@pytest.mark.parametrize("convex_hulls", [False, True], ids=["meshes", "hulls"])
+@pytest.mark.parametrize("faces", POOR.values(), ids=POOR)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_engines_agree_on_a_poor_mesh(
+    tmp_path: Path, engine: str, faces: Sequence[str], convex_hulls: bool
+) -> None:
+    write(tmp_path / "poor.obj", CUBE + "".join(f"f {face}\n" for face in faces))
+    mesh = '<mesh filename="poor.obj"/>'
+    for other in (PRIMITIVES["box"], PRIMITIVES["sphere"], mesh):
+        robot = held(tmp_path, mesh, other, convex_hulls=convex_hulls)
+        coal = make_checker("coal", robot).check
+        assert wrong(robot, coal, functools.partial(_check, engine, robot), 200) == {}
 
 
 @pytest.mark.parametrize("engine", ["coal", "fcl"])
