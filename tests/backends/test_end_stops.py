@@ -15,6 +15,9 @@ from gym_mara.testing import assert_same_state
 from tests.helpers import joint_xml, urdf_xml, write
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*below the weight of the arm")  # on purpose
+
+
 @pytest.fixture
 def weak(tmp_path: Path) -> RobotModel:
     """An arm whose motors are too weak to hold it: it falls onto the lower stop of its first joint."""
