@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import coal
+import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
@@ -22,6 +23,8 @@ from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shap
 
 _KEPT = 256
 """The number of Coal's meshes that are kept for the next robot."""
+_THIN = 1e-9
+"""What a flat mesh is thought to be thick, m."""
 
 
 class Geometry(NamedTuple):
@@ -102,8 +105,12 @@ def _mesh(
 def coal_mesh(mesh: Mesh) -> coal.CollisionGeometry:
     """Coal's form of a mesh; robots with the same mesh share it."""
     triangles = coal.BVHModelOBBRSS()
-    triangles.beginModel(len(mesh.faces), len(mesh.vertices))
-    triangles.addVertices(mesh.vertices)
+    vertices = mesh.vertices
+    if not np.ptp(vertices, axis=0).all():
+        # Pinocchio's broad phase skips shapes whose bounding box has no volume. No triangle has this vertex.
+        vertices = np.vstack([vertices, vertices.min(axis=0) - _THIN])
+    triangles.beginModel(len(mesh.faces), len(vertices))
+    triangles.addVertices(vertices)
     triangles.addTriangles(mesh.faces)
     triangles.endModel()
     if mesh.convex:

@@ -67,6 +67,10 @@ def _advice(name: str, places: Sequence[Path]) -> str:
         return "Write '/' between folders, not '\\'"
     if _is_absolute(name):
         return "A path of another machine must be changed in the URDF, to package://PACKAGE/PATH or a path beside the URDF"
+    if "://" not in name:
+        return (
+            "Put the file there, or give package_dirs=[…] the folder to which its path is relative"
+        )
     if packages := _packages(name, places):
         return f"The package is in {', '.join(map(repr, packages))}, without this file: add the file, or correct its name"
     return "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"

@@ -89,7 +89,18 @@ def _parts(path: Path, version: tuple[int, int]) -> tuple[trimesh.Trimesh, ...]:
         part.process()
         if checked.frame is not None:
             part.apply_transform(checked.frame)
-    return parts
+        _drop_degenerate(part)
+    if not any(len(part.faces) for part in parts):
+        raise GymMaraError(f"the mesh {str(path)!r} has only triangles without an area")
+    return tuple(part for part in parts if len(part.faces))
+
+
+def _drop_degenerate(part: trimesh.Trimesh) -> None:
+    """Remove triangles without an area: engines have contacts with them far away, or none."""
+    good = part.nondegenerate_faces()
+    if not good.all():
+        part.update_faces(good)
+        part.remove_unreferenced_vertices()
 
 
 def _read(path: Path, kind: str, checked: Checked) -> list[trimesh.Trimesh]:

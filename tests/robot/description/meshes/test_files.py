@@ -18,7 +18,7 @@ def _file(path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["package://arm/link.stl", "meshes/link.stl", "gone.stl"])
 def test_a_missing_file_may_be_in_package_dirs(tmp_path: Path, name: str) -> None:
-    with pytest.raises(GymMaraError, match=r"arm\.urdf.*is not found; .*Give package_dirs="):
+    with pytest.raises(GymMaraError, match=r"arm\.urdf.*is not found; .*[Gg]ive package_dirs="):
         mesh_file(tmp_path / "arm.urdf", name, ())
 
 

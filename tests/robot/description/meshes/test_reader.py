@@ -159,6 +159,15 @@ def test_a_node_of_the_library_is_read_where_it_is_named(tmp_path: Path) -> None
     )
 
 
+def test_triangles_without_an_area_are_dropped(tmp_path: Path) -> None:
+    path = write(tmp_path / "parts.obj", TWO_PARTS + "f 1 1 2\nf 3 3 3\nv 2 0 0\nf 1 2 9\n")
+    mesh = _read(path)
+    assert len(mesh.faces) == 8
+    np.testing.assert_array_equal(_bounds(mesh), [[0, 0, 0], [6, 1, 1]])
+    with pytest.raises(GymMaraError, match="only triangles without an area"):
+        _read(write(tmp_path / "line.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"))
+
+
 def test_triangles_that_are_lost_are_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
