@@ -19,6 +19,9 @@ pytestmark = pytest.mark.filterwarnings(
 )  # as wanted here
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*below the weight of the arm")  # on purpose
+
+
 @pytest.fixture
 def weak(tmp_path: Path) -> RobotModel:
     """An arm whose motors are too weak to hold it: it falls onto the lower stop of its first joint."""
