@@ -9,7 +9,6 @@ packages are relative to the record.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import math
@@ -26,7 +25,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
 from gym_mara.robot.inverse_kinematics import solve_ik
-from gym_mara.robot.keywords import ROBOT_KEYWORDS, with_paths
+from gym_mara.robot.options import ROBOT_KEYWORDS, with_paths
 from gym_mara.types import Floats
 
 MOST_STATES = 100_000
@@ -183,7 +182,7 @@ def write(file: Path, recorded: Record) -> None:
                 f"{name} is {column[state]} in state {state}; a record needs numbers"
             )
     options = with_paths(recorded.options, lambda path: os.path.relpath(path, file.parent))
-    about = dataclasses.asdict(_About(recorded.env, recorded.backend, options))
+    about = vars(_About(recorded.env, recorded.backend, options))
     text = io.StringIO()
     text.write(_HEADER + json.dumps(about, default=_plain) + "\n")
     writer = csv.writer(text, lineterminator="\n")

@@ -22,7 +22,7 @@ from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.keywords import ROBOT_KEYWORDS
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from tests.agents.conftest import ROLLOUT, config, silent
 from tests.helpers import joint_xml, urdf_xml, write
 

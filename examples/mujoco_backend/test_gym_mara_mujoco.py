@@ -22,6 +22,8 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import BackendContract, Make, uniform_q
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*below the weight of the arm")  # on purpose
+
 # A cart that carries a pole: a prismatic joint, other shapes, friction and damping. The hinge is too weak to hold the pole.
 SLIDER = """
 <robot name="slider">
@@ -121,6 +123,7 @@ def test_motors_and_joints_stay_within_their_limits(robot: RobotModel) -> None:
     assert (np.max(efforts, axis=(0, 1)) <= robot.effort_limit).all()
 
 
+@pytest.mark.filterwarnings("ignore:.*they touch in the start pose")
 def test_a_weak_arm_falls_onto_its_end_stop(tmp_path: Path) -> None:
     path = tmp_path / "weak.urdf"
     path.write_text(

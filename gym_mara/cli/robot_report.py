@@ -13,8 +13,8 @@ from gym_mara.backends.registry import backend_class
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.diagnosis.motion import body_name
-from gym_mara.robot.diagnosis.sampling import Poses
+from gym_mara.robot.diagnosis.bodies import body_name
+from gym_mara.robot.diagnosis.sampling import random_configurations
 from gym_mara.robot.kinematics import motion_axis
 from gym_mara.tasks import ReachTask
 
@@ -72,7 +72,7 @@ def _joint(robot: RobotModel, number: int) -> dict[str, Any]:
 
 def _reach(robot: RobotModel) -> float:
     """How far from the first joint's origin the tool was in random poses, m."""
-    q = Poses(robot, ()).configurations(_POSES)
+    q = random_configurations(robot, _POSES)
     position, _ = robot.kinematics().pose(np.vstack([q, robot.home]))
     return float(
         np.linalg.norm(position - robot.model.jointPlacements[1].translation, axis=1).max()
@@ -84,7 +84,7 @@ def _problem(robot: RobotModel, name: str) -> str | None:
     dynamic = backend_class(name).dynamic
     errors = [f for f in robot.findings if f.severity == "error" and (dynamic or not f.dynamics)]
     if errors:
-        return "; ".join(f"{finding.part}: {finding.message}" for finding in errors)
+        return "; ".join(finding.message for finding in errors)
     try:
         backend = make_backend(name, robot, 1, {})
         backend.reset(robot.home[None])

@@ -19,17 +19,18 @@ from gym_mara.backends import installed_backends
 from gym_mara.backends.registry import backend_class
 from gym_mara.cli.common import backend_name, err, keyword_arguments, out
 from gym_mara.cli.robot_report import report
-from gym_mara.errors import GymMaraError, MissingExtraError, unknown
+from gym_mara.errors import LARGEST, GymMaraError, MissingExtraError, unknown
 from gym_mara.extras import needs
 from gym_mara.files import MissingFileError, written_aside
 from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel, RobotOptions, catalog
-from gym_mara.robot.description.srdf import read_srdf, read_xml
+from gym_mara.robot.description.srdf import read_srdf
 from gym_mara.robot.description.urdf import ee_frame_among_links
+from gym_mara.robot.description.xml_files import read_xml
 from gym_mara.robot.diagnosis.frames import candidate_frames
 from gym_mara.robot.diagnosis.srdf_writer import disabled_pairs, srdf_text
-from gym_mara.robot.model import is_path
+from gym_mara.robot.options import is_path
 
 
 class BrokenRobotError(GymMaraError):
@@ -183,7 +184,7 @@ def _draw(arm: RobotModel, target: dict[str, Any], file: Path) -> None:
 
 def _print(found: dict[str, Any]) -> None:
     table = _table("Findings", "", "part", "what is wrong", "effect", "remedy")
-    for finding in found["findings"]:
+    for finding in sorted(found["findings"], key=lambda f: list(_COLOURS).index(f["severity"])):
         where = "with dynamics: " if finding["dynamics"] else ""
         table.add_row(
             Text(finding["severity"], _COLOURS[finding["severity"]]),
@@ -196,7 +197,7 @@ def _print(found: dict[str, Any]) -> None:
         out.print(table)
     else:
         out.print("Nothing is wrong with the files.")
-    out.print(_joints(found["joints"]))
+    out.print(_joints(found["joints"], found["home"]))
     counts = found["pairs"]["count"]
     excluded = ", ".join(f"{n} {why}" for why, n in counts.items() if why != "checked")
     position = ", ".join(f"{x:.3f}" for x in found["default_target"]["position"])
@@ -209,16 +210,16 @@ def _print(found: dict[str, Any]) -> None:
         out.print(f"Backend {name}: {'works' if problem is None else f'does not work: {problem}'}")
 
 
-def _joints(joints: list[dict[str, Any]]) -> Table:
-    names = "joint", "type", "limits", "velocity", "effort", "axis", "moves", "kg"
+def _joints(joints: list[dict[str, Any]], home: list[float]) -> Table:
+    names = "joint", "type", "limits", "start", "velocity", "effort", "axis", "moves", "kg"
     table = _table("Joints, in rad and Nm (prismatic: m and N)", *names)
-    for joint in joints:
+    for joint, start in zip(joints, home, strict=True):
         table.add_row(
             joint["name"],
             joint["type"],
             f"{joint['lower']:.4g} to {joint['upper']:.4g}",
-            f"{joint['velocity']:.4g}",
-            f"{joint['effort']:.4g}",
+            f"{start:.4g}",
+            *("none" if joint[n] >= LARGEST else f"{joint[n]:.4g}" for n in ("velocity", "effort")),
             " ".join(f"{x:.3g}" for x in joint["axis"]),
             joint["link"],
             f"{joint['mass']:.4g}",

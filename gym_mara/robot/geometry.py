@@ -13,15 +13,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import coal
+import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.description.mesh_files import mesh_file
+from gym_mara.robot.description.meshes.files import mesh_file
 from gym_mara.robot.description.parser import parsing
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 _KEPT = 256
 """The number of Coal's meshes that are kept for the next robot."""
+_THIN = 1e-9
+"""What a flat mesh is thought to be thick, m."""
 
 
 class Geometry(NamedTuple):
@@ -89,7 +92,9 @@ def read_geometry(
 def _mesh(
     urdf: Path, element: ElementTree.Element, convex: bool, package_dirs: Sequence[str]
 ) -> Mesh:
-    from gym_mara.robot.description.meshes import read_mesh  # most robots here have no meshes
+    from gym_mara.robot.description.meshes.reader import (
+        read_mesh,
+    )  # most robots here have no meshes
 
     x, y, z = map(float, element.get("scale", "1 1 1").split())
     path = mesh_file(urdf, element.get("filename", ""), package_dirs)
@@ -100,8 +105,12 @@ def _mesh(
 def coal_mesh(mesh: Mesh) -> coal.CollisionGeometry:
     """Coal's form of a mesh; robots with the same mesh share it."""
     triangles = coal.BVHModelOBBRSS()
-    triangles.beginModel(len(mesh.faces), len(mesh.vertices))
-    triangles.addVertices(mesh.vertices)
+    vertices = mesh.vertices
+    if not np.ptp(vertices, axis=0).all():
+        # Pinocchio's broad phase skips shapes whose bounding box has no volume. No triangle has this vertex.
+        vertices = np.vstack([vertices, vertices.min(axis=0) - _THIN])
+    triangles.beginModel(len(mesh.faces), len(vertices))
+    triangles.addVertices(vertices)
     triangles.addTriangles(mesh.faces)
     triangles.endModel()
     if mesh.convex:

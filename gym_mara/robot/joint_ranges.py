@@ -14,11 +14,12 @@ _ROUNDED = 1e-4
 def action_range(robot: RobotModel) -> tuple[Floats, Floats]:
     """The lowest and the highest joint target that an action can ask for, each (J,), rad (m for a prismatic joint).
 
-    A revolute joint has ±π, as in the paper, or its limits if these go beyond ±π. A prismatic joint has its travel.
+    A revolute joint has ±π, as in the paper, or its limits if these go beyond ±π. A prismatic joint has its travel, unless it
+    cannot move: Gymnasium warns of bounds that are equal.
     """
     lower, upper = robot.lower, robot.upper
     beyond = (lower < -np.pi - _ROUNDED) | (upper > np.pi + _ROUNDED)
-    whole = robot.kinematics().prismatic | beyond
+    whole = (robot.kinematics().prismatic & (lower < upper)) | beyond
     return np.where(whole, lower, -np.pi), np.where(whole, upper, np.pi)
 
 

@@ -23,9 +23,12 @@ from gym_mara.robot.description.urdf import build, ee_frame_among_links, find_ch
 from gym_mara.robot.description.xml_files import read_xml
 from gym_mara.robot.diagnosis import (
     Finding,
+    body_findings,
     collision_findings,
-    motion_findings,
+    joint_findings,
+    range_findings,
     semantics_findings,
+    written_limits,
 )
 from gym_mara.robot.geometry import read_geometry
 from gym_mara.robot.inertia import add_inertias
@@ -67,7 +70,7 @@ def from_files(
     ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
     target = read_target(urdf)
     robot = _build(cls, root, semantics, ee_frame, name, urdf, srdf, (), target, options)
-    of_files += semantics_findings(srdf, semantics, root) if srdf else []
+    of_files += semantics_findings(robot, semantics, root)
     return _with_findings(robot, findings, of_files)
 
 
@@ -106,6 +109,7 @@ def _build(
     """The arm of a URDF that has been read, without findings."""
     empty = drop_empty_shapes(root)
     chain = find_chain(urdf, root, ee_frame)
+    written = written_limits(root)
     followers = keep_chain(urdf, root, chain, semantics.home_pose(chain).values)
     model, of_parser = build(urdf, root, chain, followers)
     xml = ElementTree.tostring(root, encoding="unicode")
@@ -138,7 +142,7 @@ def _build(
         geometry=geometry,
         shapes=shapes,
         options=options,
-        findings=(*empty, *of_parser),
+        findings=(*empty, *of_parser, *range_findings(written, chain, followers, model)),
     )
 
 
@@ -147,7 +151,8 @@ def _with_findings(
 ) -> RobotModel:
     """The arm with these findings, or else with those of its files and its own."""
     if findings is None:
-        findings = [*of_files, *robot.findings, *motion_findings(robot), *collision_findings(robot)]
+        own = [*joint_findings(robot), *body_findings(robot), *collision_findings(robot)]
+        findings = [*of_files, *robot.findings, *own]
     return replace(robot, findings=tuple(findings))
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,7 +23,7 @@ from gym_mara.robot.diagnosis import Finding, raise_errors, warn
 from gym_mara.robot.geometry import Geometry, read_geometry
 from gym_mara.robot.kinematics import Kinematics, motion_axis
 from gym_mara.robot.loading import from_files, from_modules, read_only, with_notes
-from gym_mara.robot.options import RobotOptions
+from gym_mara.robot.options import RobotOptions, is_path
 from gym_mara.types import Floats
 
 
@@ -71,6 +71,8 @@ class RobotModel:
     """What was added to the files."""
     findings: tuple[Finding, ...]
     """What is wrong with the files."""
+    _unwarned: bool = field(default=False, init=False)
+    """Whether the warnings for backends with dynamics are still to come."""
 
     @classmethod
     def load(
@@ -182,7 +184,8 @@ class RobotModel:
     def _checked(self) -> RobotModel:
         """This robot; raises and warns by its findings, in the name of the caller of the calling method."""
         raise_errors(self.name, self.findings, dynamics=False)
-        warn(repr(str(self.urdf)), self.findings, stacklevel=3)
+        warn(repr(str(self.urdf)), self.findings, dynamics=False, stacklevel=3)
+        object.__setattr__(self, "_unwarned", True)
         return self
 
     @property
@@ -203,12 +206,15 @@ class RobotModel:
         return visual if visual.shapes else Geometry(self.geometry, self.shapes)
 
     def require_dynamics(self) -> None:
-        """Check that backends with dynamics can simulate this arm.
+        """Check that backends with dynamics can simulate this arm, and warn once of what is probably not meant.
 
         Raises:
             GymMaraError: they cannot; it says why, and what to do.
         """
         raise_errors(self.name, self.findings, dynamics=True)
+        if self._unwarned:
+            object.__setattr__(self, "_unwarned", False)
+            warn(repr(str(self.urdf)), self.findings, dynamics=True, stacklevel=2)
 
     def motion(self, number: int) -> Floats:
         """The motion subspace (6,) of a joint of `model`, in its own frame: linear part, then angular.
@@ -273,21 +279,14 @@ class RobotModel:
         if self.modules:
             return from_modules, (RobotModel, self.modules, self.options, self.findings)
         files = self.urdf, self.ee_frame, self.srdf, self.name
-        return from_files, (RobotModel, *files, self.options, self.findings)
+        arguments = (RobotModel, *files, self.options, self.findings)
+        return from_files, arguments, {"_unwarned": self._unwarned}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
         return self  # immutable
 
     def __repr__(self) -> str:
         return f"RobotModel({self.name!r}, joints={list(self.joint_names)}, ee_frame={self.ee_frame!r})"
-
-
-def is_path(robot: object) -> TypeGuard[str | Path]:
-    """Whether a robot is given by the path of its URDF."""
-    if isinstance(robot, str):
-        name = robot.lower()
-        return name.endswith((".urdf", ".xml", ".xacro")) or os.sep in name or "/" in name
-    return isinstance(robot, Path)
 
 
 RobotLike = str | Sequence[str] | RobotModel

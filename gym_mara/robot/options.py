@@ -1,10 +1,12 @@
-"""What a user adds to a robot's files: where packages are, and values that the URDF lacks or has wrong."""
+"""The keyword arguments that describe a robot: which one, where its packages are, and values that replace those of its files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 import pinocchio as pin
@@ -93,8 +95,29 @@ def _per_joint(name: str, given: Any) -> PerJoint | None:
     return None if given is None else positive_number(name, given)
 
 
-def text_keywords(options: RobotOptions) -> str:
-    """The options that differ from the defaults, for messages."""
-    defaults = RobotOptions()
-    changed = (n for n in vars(options) if getattr(options, n) != getattr(defaults, n))
-    return ", ".join(f"{name}={getattr(options, name)!r}" for name in changed)
+ROBOT_KEYWORDS = ("robot", "ee_frame", *(field.name for field in fields(RobotOptions)))
+"""Those that name the robot, and its options."""
+
+
+def is_path(robot: object) -> TypeGuard[str | Path]:
+    """Whether a robot is given by the path of its URDF."""
+    if isinstance(robot, str):
+        name = robot.lower()
+        return name.endswith((".urdf", ".xml", ".xacro")) or os.sep in name or "/" in name
+    return isinstance(robot, Path)
+
+
+def with_paths(options: dict[str, Any], moved: Callable[[str], str]) -> dict[str, Any]:
+    """Keyword arguments in which `moved` replaces each relative path: of the robot, and of its `package_dirs`."""
+
+    def replaced(path: Any) -> Any:
+        return path if not isinstance(path, str) or os.path.isabs(path) else moved(path)
+
+    changed = dict(options)
+    if is_path(robot := options.get("robot")):
+        changed["robot"] = replaced(os.fspath(robot))
+    if isinstance(
+        folders := options.get("package_dirs"), (list, tuple)
+    ):  # others are refused later
+        changed["package_dirs"] = [replaced(folder) for folder in folders]
+    return changed

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 _ONE = 1.0 + 1e-9
 """The bound of a unit quaternion's components, with a margin for rounding."""
 
+_NARROWEST = 1e-9
+"""The least difference of two bounds."""
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -62,7 +65,8 @@ class Observation:
         wider = [overshoot if part.joint_limits else 0.0 for part in parts]
         low = np.concatenate([part.low - by for part, by in zip(parts, wider, strict=True)])
         high = np.concatenate([part.high + by for part, by in zip(parts, wider, strict=True)])
-        self.space = Box(low, high, dtype=np.float64)
+        # Gymnasium warns of equal bounds, such as those of a joint that cannot move.
+        self.space = Box(low, np.maximum(high, low + _NARROWEST), dtype=np.float64)
         """The space of one flat observation (O,)."""
         self._ends = np.cumsum([len(part.low) for part in parts]).tolist()
 

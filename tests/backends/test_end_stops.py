@@ -14,6 +14,8 @@ from gym_mara.robot import RobotModel
 from gym_mara.testing import assert_same_state
 from tests.helpers import joint_xml, urdf_xml, write
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*below the weight of the arm")  # on purpose
+
 
 @pytest.fixture
 def weak(tmp_path: Path) -> RobotModel:

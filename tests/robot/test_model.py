@@ -79,7 +79,8 @@ def test_an_srdf_beside_the_urdf_says_pose_end_effector_and_pairs(tmp_path: Path
           <disable_collisions link1="link2" link2="link0"/>
         </robot>""",
     )
-    robot = _load(tmp_path, urdf_xml(*map(joint_xml, range(3))), None)
+    with pytest.warns(UserWarning, match="joint joint1: the SRDF's pose 'rest' puts it beyond"):
+        robot = _load(tmp_path, urdf_xml(*map(joint_xml, range(3))), None)
     assert robot.ee_frame == "link2"
     np.testing.assert_array_equal(robot.home, [0.25, 1.5])
     # link3 hangs behind the end effector, locked to link2; link2 and link0 are disabled, the rest are neighbours.

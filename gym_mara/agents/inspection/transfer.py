@@ -15,7 +15,7 @@ from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.envs import task_keywords
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown, whole_number
-from gym_mara.robot.keywords import ROBOT_KEYWORDS
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats
 
 SETTLED = 0.005

@@ -13,7 +13,7 @@ from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import DamagedFileError, parsed_json, read_json
 from gym_mara.rendering import RenderSettings
-from gym_mara.robot.keywords import with_paths
+from gym_mara.robot.options import with_paths
 
 MOST_STEPS = 10**12
 

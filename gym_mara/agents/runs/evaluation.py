@@ -18,7 +18,7 @@ from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.keywords import ROBOT_KEYWORDS
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")

@@ -22,7 +22,7 @@ import numpy as np
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import plain_size
 from gym_mara.robot.description.joints import link_at
-from gym_mara.robot.description.mesh_files import candidates
+from gym_mara.robot.description.meshes.files import candidates
 from gym_mara.robot.diagnosis import Finding, Severity
 
 # More than any robot has; the number of pairs of shapes grows with the square.
@@ -102,7 +102,7 @@ def check_urdf(
 ) -> list[Finding]:
     """Check a URDF: how much it holds, its elements, its numbers, its tree of links, and its mesh files.
 
-    Spaces between numbers are made single, because urdfdom reads no others.
+    Spaces between numbers are made single, and a robot without a name gets that of its file, because urdfdom reads no others.
 
     Args:
         urdf: the file.
@@ -124,6 +124,17 @@ def check_urdf(
                 f"{str(urdf)!r} has {found:,} elements <{tag}>; at most {most:,} are allowed"
             )
     findings: list[Finding] = []
+    if not root.get("name"):
+        root.set("name", urdf.stem)
+        findings.append(
+            Finding(
+                "note",
+                "<robot>",
+                "it has no name",
+                f"it is called {urdf.stem!r}; other programs refuse the file",
+                'Write <robot name="…">',
+            )
+        )
     try:
         for part in root:
             ignored = list(_odd(root, part))

@@ -14,10 +14,8 @@ _DEEPEST = 100
 """Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
 _OF_OTHERS = ("gazebo", "transmission", "ros2_control")
 """Elements for other programs."""
-_XACRO = re.compile(r"\{[^}]*xacro[^}]*\}")
-"""The namespace of xacro's elements."""
-_DEFINES = re.compile(_XACRO.pattern + "(property|arg)$")
-"""Elements of xacro that change nothing by themselves: what uses them has ${…} or $(arg …)."""
+_DEFINED = ("property", "arg")
+"""Elements of xacro that only define values: where no value is used, nothing is to be expanded."""
 
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
@@ -38,7 +36,8 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
         if "unbound prefix" in str(error) and b"<xacro:" in content:
             raise _not_expanded(path, kind, "it has elements <xacro:…>") from None
-        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
+        line = _line_of(error, content)
+        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}{line}") from error
     if _depth(root) > _DEEPEST:
         raise GymMaraError(
             f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
@@ -50,6 +49,14 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     return root
 
 
+def _line_of(error: Exception, content: bytes) -> str:
+    """The line of a file where the parser stopped, for an error; empty if it has no text."""
+    number, _ = getattr(error, "position", (0, 0))
+    line = content.splitlines()[number - 1 : number]
+    text = line[0].decode(errors="replace").strip() if line else ""
+    return f": {short(text)}" if text else ""
+
+
 def _urdfs_in(folder: Path) -> str:
     """The URDFs in a folder, for an error."""
     names = sorted(file.name for file in folder.iterdir() if file.suffix.lower() == ".urdf")
@@ -59,12 +66,13 @@ def _urdfs_in(folder: Path) -> str:
 def _xacro_in(root: ElementTree.Element) -> str:
     """What shows that a file was not expanded by xacro; empty if nothing does."""
     for part in root:
-        if part.tag in _OF_OTHERS or _DEFINES.match(str(part.tag)):
+        if part.tag in _OF_OTHERS:
             continue
         for element in part.iter():
             tag = str(element.tag)
-            if _XACRO.match(tag):
-                return f"it has an element <xacro:{tag.rpartition('}')[2]}>"
+            own = re.match(r"\{[^}]*xacro[^}]*\}(.*)", tag)
+            if own and own[1] not in _DEFINED:
+                return f"it has an element <xacro:{own[1]}>"
             for name, value in element.items():
                 if "${" in value or "$(" in value:
                     return f"<{tag}> has {name}={short(value)}"

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING
 
-from gym_mara.robot.collision_pairs import AT_HOME, Pair
+from gym_mara.robot.collision_pairs import AT_HOME, Pair, touching_pairs
 from gym_mara.robot.diagnosis.finding import Finding, listed
 from gym_mara.robot.diagnosis.sampling import ALWAYS, moving_links, often_touching, shares
 
 if TYPE_CHECKING:
     from gym_mara.robot.model import RobotModel
+
+_SHOWN = 4
+"""The number of pairs that a finding lists; `gym-mara robot --json` lists all."""
 
 
 def collision_findings(robot: RobotModel) -> list[Finding]:
@@ -65,7 +68,16 @@ def _touching(robot: RobotModel) -> Iterator[Finding]:
             never_checked,
             _remedy(robot),
         )
-    if often := often_touching(robot):
+    often = often_touching(robot)
+    if colliding := touching_pairs(robot.model, robot.geometry, robot.home) - often.keys():
+        yield Finding(
+            "warning",
+            f"links {pair_names(colliding)}",
+            "they touch in the start pose, and are checked for collision",
+            "every episode begins in a collision",
+            f"Put another pose first in the SRDF. {_remedy(robot)}",
+        )
+    if often:
         lowest, highest = (f"{100 * of(often.values()):.0f} %" for of in (min, max))
         span = lowest if lowest == highest else f"{lowest} to {highest}"
         yield Finding(
@@ -88,4 +100,4 @@ def _remedy(robot: RobotModel) -> str:
 def pair_names(pairs: Collection[Pair]) -> str:
     """Pairs of links for a message: in alphabetical order, unless they are in a list."""
     names = [" and ".join(sorted(pair)) for pair in pairs]
-    return listed(names if isinstance(pairs, list) else sorted(names))
+    return listed(names if isinstance(pairs, list) else sorted(names), _SHOWN)

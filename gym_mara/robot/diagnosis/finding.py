@@ -11,7 +11,7 @@ from gym_mara.errors import GymMaraError
 
 Severity = Literal["error", "warning", "note"]
 _SHOWN = 10
-"""The number of names that a finding lists."""
+"""The number of names that a finding lists, unless it says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -50,23 +50,24 @@ def raise_errors(name: str, findings: Iterable[Finding], *, dynamics: bool) -> N
         )
 
 
-def warn(source: str, findings: Iterable[Finding], *, stacklevel: int) -> None:
-    """Warn once of each warning among findings.
+def warn(source: str, findings: Iterable[Finding], *, dynamics: bool, stacklevel: int) -> None:
+    """Warn of each warning among findings: those of backends with dynamics, or those of every backend.
 
     Args:
         source: the file that they are about.
         findings: the findings.
+        dynamics: which of them.
         stacklevel: 1 for the caller of this function, 2 for its caller, and so on.
     """
     for finding in findings:
-        if finding.severity == "warning":
+        if finding.severity == "warning" and finding.dynamics == dynamics:
             warnings.warn(f"{source}: {finding}", stacklevel=stacklevel + 1)
 
 
-def listed(names: Sequence[str]) -> str:
-    """The names for a message: at most ten of them, and how many more there are."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+def listed(names: Sequence[str], most: int = _SHOWN) -> str:
+    """The names for a message: some of them, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def parts(kind: str, names: Sequence[str]) -> str:

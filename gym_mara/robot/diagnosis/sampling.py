@@ -31,6 +31,16 @@ _LONGEST_TRAVEL = 1e3
 """Of a prismatic joint, m."""
 
 
+def random_configurations(robot: RobotModel, count: int) -> Floats:
+    """Random configurations (N, J) within the limits of an arm, rad; fewer are the first of more."""
+    # A joint of several turns is drawn from one of them.
+    span = 2.0 * np.where(robot.kinematics().prismatic, _LONGEST_TRAVEL, np.pi)
+    wide = robot.upper - robot.lower > span
+    low = np.where(wide, np.clip(-0.5 * span, robot.lower, robot.upper - span), robot.lower)
+    high = np.where(wide, low + span, robot.upper)
+    return np.random.default_rng(0).uniform(low, high, (count, robot.num_joints))
+
+
 class Poses:
     """Counts the touching pairs of links in random poses of an arm.
 
@@ -40,20 +50,11 @@ class Poses:
     """
 
     def __init__(self, robot: RobotModel, pairs: Iterable[Pair]) -> None:
-        # A joint of several turns is drawn from one of them.
-        span = 2.0 * np.where(robot.kinematics().prismatic, _LONGEST_TRAVEL, np.pi)
-        wide = robot.upper - robot.lower > span
-        low = np.where(wide, np.clip(-0.5 * span, robot.lower, robot.upper - span), robot.lower)
-        self._range = low, np.where(wide, low + span, robot.upper)
         self.pairs = frozenset(pairs)
         self._model, self._all = robot.model, robot.geometry.copy()
         self._all.removeAllCollisionPairs()
         self._all.addAllCollisionPairs()
         keep_pairs(self._model, self._all, self.pairs)
-
-    def configurations(self, count: int) -> Floats:
-        """Random configurations (N, J), rad; fewer are the first of more."""
-        return np.random.default_rng(0).uniform(*self._range, (count, self._model.nq))
 
     def count(self, q: Floats, pairs: Iterable[Pair] | None = None) -> Counter[Pair]:
         """In how many of the configurations q (N, J) each pair touches; all pairs, or these."""
@@ -112,7 +113,7 @@ def _key(robot: RobotModel) -> tuple[Any, ...]:
 def _often_touching(arm: _Arm) -> dict[Pair, float]:
     robot = arm.robot
     moving, poses = moving_links(robot), Poses(robot, robot.collision_pairs)
-    pairs, q = robot.collision_pairs, poses.configurations(POSES)
+    pairs, q = robot.collision_pairs, random_configurations(robot, POSES)
     for stage in _STAGES:
         counts = poses.count(q[:stage], pairs)
         pairs = frozenset(p for p in pairs if counts[p] > 0.5 * limit_of(p, moving) * stage)
@@ -123,6 +124,6 @@ def _often_touching(arm: _Arm) -> dict[Pair, float]:
 @lru_cache(maxsize=16)
 def _shares(arm: _Arm, pairs: frozenset[Pair]) -> dict[Pair, float]:
     poses = Poses(arm.robot, pairs)
-    q = poses.configurations(_STAGES[-1])
+    q = random_configurations(arm.robot, _STAGES[-1])
     counts = poses.count(q)
     return {pair: counts[pair] / len(q) for pair in pairs}

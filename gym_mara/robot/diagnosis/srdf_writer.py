@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from gym_mara.robot.collision_pairs import Pair, joined
-from gym_mara.robot.diagnosis.sampling import ALWAYS, POSES, Poses, limit_of, moving_links
+from gym_mara.robot.diagnosis.sampling import (
+    ALWAYS,
+    POSES,
+    Poses,
+    limit_of,
+    moving_links,
+    random_configurations,
+)
 
 if TYPE_CHECKING:
     from gym_mara.robot.model import RobotModel
@@ -25,7 +32,7 @@ def disabled_pairs(robot: RobotModel) -> dict[Pair, str]:
     """
     moving, neighbours = moving_links(robot), joined(ElementTree.fromstring(robot.xml))
     poses = Poses(robot, robot.collision_pairs | robot.excluded_pairs.keys())
-    q, at_home = poses.configurations(MOST_POSES), poses.count(robot.home[None])
+    q, at_home = random_configurations(robot, MOST_POSES), poses.count(robot.home[None])
     counts = poses.count(q[:POSES])
     never = poses.pairs - counts.keys() - at_home.keys() - neighbours
     for start in range(POSES, MOST_POSES, POSES):

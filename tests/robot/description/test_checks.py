@@ -93,9 +93,9 @@ def test_a_broken_part_is_an_error_that_names_it(
         ("</robot>", f"{COLLISION}</robot>", "<collision> stands in <robot>"),
         (COLLISION, f"{COLLISION}{INERTIA}", "<inertia> stands in <link>"),
         (
-            'lower="-2"',
-            'Lower="-2"',
-            "joint 'j1': <limit> has no attribute 'Lower'.* Probably 'low",
+            'xyz="0 0 0.02"',
+            'XYZ="0 0 0.02"',
+            "joint 'j1': <origin> has no attribute 'XYZ'.* Probably 'xyz",
         ),
         (INERTIA, INERTIA + INERTIA, "link 'l1': <inertial> has 2 elements <inertia>.*the first"),
         ('<origin xyz="0 0 0.02"/>', "<origin>0 0 0.02</origin>", "<origin> holds the text '0 0 0"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import re
 from pathlib import Path
 
 import pytest
@@ -32,16 +32,18 @@ def test_xacro_is_answered_by_how_to_expand_it(
         RobotModel.load(str(write(tmp_path / name, text)), "tool")
 
 
-def test_definitions_that_nothing_uses_do_not_make_a_template(tmp_path: Path) -> None:
-    definitions = '<xacro:property name="width" value="0.2"/><xacro:arg name="size" default="2"/>'
-    text = upright_arm().replace(
-        '<robot name="upright">',
-        f'<robot name="upright" xmlns:xacro="http://www.ros.org/wiki/xacro">{definitions}',
+@pytest.mark.parametrize("used", ["", "${width}"])
+def test_a_property_of_xacro_that_is_not_used_is_no_template(tmp_path: Path, used: str) -> None:
+    element = '<xacro:property name="width" value=".2"/><xacro:arg name="a" default="1"/>'
+    text = re.sub(
+        "<robot[^>]*>", f'<robot name="{used}" xmlns:xacro="xacro">{element}', upright_arm()
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        robot = RobotModel.load(write(tmp_path / "arm.urdf", text), "tool")
-    assert robot.num_joints == 3
+    urdf = write(tmp_path / "arm.urdf", text.replace('upper="2"', f'upper="{used or 2}"'))
+    if used:
+        with pytest.raises(GymMaraError, match=r"<limit> has upper='\${width}'"):
+            RobotModel.load(urdf, "tool")
+    else:
+        assert RobotModel.load(urdf, "tool").num_joints == 3
 
 
 @pytest.mark.parametrize(
@@ -71,3 +73,24 @@ def test_a_folder_is_answered_by_its_urdfs(tmp_path: Path) -> None:
     write(tmp_path / "arm.urdf", upright_arm())
     with pytest.raises(GymMaraError, match=r"is a folder; name one of its URDFs: arm\.urdf"):
         RobotModel.load(str(tmp_path), "tool")
+
+
+def test_broken_xml_is_answered_by_its_line(tmp_path: Path) -> None:
+    text = upright_arm().replace("<link", "\n<<<<<<< HEAD\n<link", 1)
+    with pytest.raises(GymMaraError, match=r"broken XML: .*line 3, column 1: '<<<<<<< HEAD'"):
+        RobotModel.load(str(write(tmp_path / "arm.urdf", text)), "tool")
+
+
+@pytest.mark.parametrize("content", [b"", b"\n", b"\xff\xfe<\x00", b"<robot>"])
+def test_broken_xml_without_such_a_line_is_still_an_error(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "arm.urdf").write_bytes(content)
+    with pytest.raises(GymMaraError, match="broken XML"):
+        RobotModel.load(str(tmp_path / "arm.urdf"), "tool")
+
+
+@pytest.mark.parametrize("name", ["", ' name=""'])
+def test_a_robot_without_a_name_gets_that_of_its_file(tmp_path: Path, name: str) -> None:
+    text = re.sub("<robot[^>]*>", f"<robot{name}>", upright_arm())
+    robot = RobotModel.load(str(write(tmp_path / "bar.urdf", text)), "tool")
+    assert robot.name == "bar"
+    assert [finding.part for finding in robot.findings if "name" in finding.message] == ["<robot>"]

@@ -10,6 +10,7 @@ import pytest
 from gym_mara.robot import RobotModel
 from gym_mara.robot.collision_pairs import AT_HOME, DISABLED, NEIGHBOURS, touching_pairs
 from gym_mara.robot.diagnosis import sampling
+from gym_mara.robot.diagnosis.collisions import pair_names
 from gym_mara.robot.diagnosis.sampling import Poses
 from gym_mara.robot.diagnosis.srdf_writer import disabled_pairs, srdf_text
 from tests.helpers import robot_model, write
@@ -84,7 +85,7 @@ def test_an_obstacle_that_is_often_hit_is_no_warning(tmp_path: Path) -> None:
     urdf = arm_file(tmp_path, arm(base=ceiling), srdf + "</group_state>")
     robot = RobotModel.load(urdf, TOOL)
     counts = Poses(robot, robot.collision_pairs).count(
-        Poses(robot, ()).configurations(sampling.POSES)
+        sampling.random_configurations(robot, sampling.POSES)
     )
     assert counts[_pair("base", "l3")] > sampling.OFTEN * sampling.POSES
     assert robot.findings == ()
@@ -93,7 +94,7 @@ def test_an_obstacle_that_is_often_hit_is_no_warning(tmp_path: Path) -> None:
 def test_the_shares_are_those_of_all_random_poses(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="random poses"):
         robot = RobotModel.load(_often(tmp_path), TOOL)
-    q = Poses(robot, ()).configurations(sampling.POSES)
+    q = sampling.random_configurations(robot, sampling.POSES)
     assert ((q >= robot.lower) & (q <= robot.upper)).all()
     hits = [_pair("l1", "l3") in touching_pairs(robot.model, robot.geometry, row) for row in q]
     assert sampling.often_touching(robot) == {_pair("l1", "l3"): np.mean(hits)}
@@ -118,6 +119,31 @@ def test_an_srdf_that_disables_the_defaults_of_a_link(tmp_path: Path) -> None:
         _pair("l2", "l3"): DISABLED,
         _pair("l1", "l3"): DISABLED,
     }
+
+
+def test_checked_pairs_that_touch_at_home_are_a_warning(tmp_path: Path) -> None:
+    srdf = '<disable_collisions link1="base" link2="l2" reason="Never"/>'
+    urdf = arm_file(tmp_path, arm(origins=FOLDED), srdf)
+    with pytest.warns(
+        UserWarning, match="links l1 and l3: .*every episode begins in a collision"
+    ) as warned:
+        robot = RobotModel.load(urdf, TOOL)
+    assert len(warned) == 1
+    assert _pair("l1", "l3") in robot.collision_pairs
+
+
+def test_a_home_pose_beyond_the_limits_is_a_warning(tmp_path: Path) -> None:
+    values = "".join(f'<joint name="j{n}" value="{q}"/>' for n, q in ((1, 0), (2, 2.0005), (3, -3)))
+    srdf = f'<group_state name="up" group="arm">{values}</group_state>'
+    with pytest.warns(UserWarning, match="joint j3: the SRDF's pose 'up' puts it beyond") as warned:
+        robot = RobotModel.load(arm_file(tmp_path, srdf=srdf), TOOL)
+    assert len(warned) == 1
+    np.testing.assert_array_equal(robot.home, [0.0, 2.0, -2.0])
+
+
+def test_a_finding_lists_a_few_pairs() -> None:
+    pairs = [_pair("a", str(number)) for number in range(30)]
+    assert pair_names(pairs) == "0 and a, 1 and a, 2 and a, 3 and a and 26 more"
 
 
 @pytest.mark.parametrize(

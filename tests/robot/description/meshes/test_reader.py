@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.description.meshes import read_mesh
+from gym_mara.robot.description.meshes.reader import read_mesh
 from gym_mara.robot.description.shapes import Mesh
 from tests.helpers import Floats, write
 
@@ -20,6 +20,8 @@ STL_TEXT = BOX.export(file_type="stl_ascii")
 OBJ = BOX.export(file_type="obj")
 PLY = BOX.export(file_type="ply", encoding="ascii").decode()
 NODE = '<node><instance_geometry url="#g"/></node>'
+SCENE = '<scene><instance_visual_scene url="#s"/></scene>'
+LINES = '<lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>'
 TWO_PARTS = """v 0 0 0
 v 1 0 0
 v 0 1 0
@@ -123,6 +125,59 @@ def test_a_collada_file(
     assert _volume(mesh) > 0.0
 
 
+BOUND = NODE.replace(
+    "/></node>",
+    '><bind_material><technique_common><instance_material symbol="s" target="#m"/></technique_common></bind_material>'
+    "</instance_geometry></node>",
+)
+MATERIAL = """<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse><color>1 0 0 1</color></diffuse>
+</lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>"""
+
+
+@pytest.mark.parametrize("target", ["#gone", "gone", "", "#m"])
+def test_a_part_without_its_material_is_read(tmp_path: Path, target: str) -> None:
+    """A material is only a colour. Exporters name materials that they do not write."""
+    other = f"<node><translate>5 0 0</translate>{BOUND}</node>"
+    text = dae(nodes=BOUND.replace("#m", target) + other)
+    if target != "#m":
+        text = text.replace("<library_geometries>", f"{MATERIAL}<library_geometries>")
+    text = text.replace('<triangles count="4">', '<triangles count="4" material="s">')
+    mesh = _read(write(tmp_path / "part.dae", text))
+    assert len(mesh.faces) == 8
+    np.testing.assert_allclose(_bounds(mesh), [(0, 0, 0), (6, 2, 3)])
+    if target != "#m":
+        assert [part.visual.kind for part in mesh.parts].count("texture") == 1
+
+
+def test_a_node_of_the_library_is_read_where_it_is_named(tmp_path: Path) -> None:
+    node = f'<library_nodes><node id="n">{NODE}</node></library_nodes>'
+    uses = '<node><instance_node url="#n"/></node><node><translate>5 0 0</translate><instance_node url="#n"/></node>'
+    text = dae(nodes=uses).replace("<library_visual_scenes>", f"{node}<library_visual_scenes>")
+    np.testing.assert_allclose(
+        _bounds(_read(write(tmp_path / "a.dae", text))), [(0, 0, 0), (6, 2, 3)]
+    )
+
+
+def test_triangles_without_an_area_are_dropped(tmp_path: Path) -> None:
+    path = write(tmp_path / "parts.obj", TWO_PARTS + "f 1 1 2\nf 3 3 3\nv 2 0 0\nf 1 2 9\n")
+    mesh = _read(path)
+    assert len(mesh.faces) == 8
+    np.testing.assert_array_equal(_bounds(mesh), [[0, 0, 0], [6, 1, 1]])
+    with pytest.raises(GymMaraError, match="only triangles without an area"):
+        _read(write(tmp_path / "line.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"))
+
+
+def test_triangles_that_are_lost_are_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "parts.obj", TWO_PARTS)
+    whole = trimesh.Scene.dump
+    monkeypatch.setattr(trimesh.Scene, "dump", lambda scene: whole(scene)[1:])
+    with pytest.raises(GymMaraError, match=r"has 8 triangles, of which 4 can be read"):
+        _read(path)
+
+
 def test_an_obj_of_two_materials_has_both_parts(tmp_path: Path) -> None:
     mesh = _read(write(tmp_path / "parts.obj", TWO_PARTS))
     assert len(mesh.parts) == 2
@@ -171,7 +226,15 @@ def test_the_hull_of_a_flat_mesh_is_the_mesh(tmp_path: Path) -> None:
         ("a.dae", dae(points="0 0 0 NaN 0 0 0 2 0 0 0 3"), "not finite"),
         ("a.dae", dae().replace("<p>0 2", "<p>9 2"), "maxindex=9"),
         ("a.dae", dae(nodes=NODE + NODE.replace("#g", "#other")), "#other"),
-        ("a.off", "OFF", r"supported are .dae, .obj, .ply, .stl"),
+        ("a.dae", dae().replace(SCENE, ""), "no <scene>"),
+        ("a.dae", dae(nodes='<node><instance_node url="#n"/></node>'), "node 'n' is missing"),
+        ("a.dae", dae(nodes='<node><instance_controller url="#n"/></node>'), "armature"),
+        (
+            "a.dae",
+            dae().replace("<triangles", f"{LINES}<triangles").replace("<p>0 2", "<p>9 2"),
+            "maxindex=9",
+        ),
+        ("a.off", "OFF", r"supported are .dae, .glb, .gltf, .obj, .ply, .stl"),
         ("a", STL, "supported are"),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 20 else "",
