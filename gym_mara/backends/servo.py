@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gym_mara.backends.base import Backend, limited_velocity
-from gym_mara.errors import LARGEST, GymMaraError, one_of, positive_number
+from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact, SimState
@@ -143,14 +143,8 @@ class ServoBackend(Backend):
             self._rebuild(arm, self._q[arm], self._qd[arm])
         if self.on_divergence == "error":
             first = int(diverged.argmax())
-            limits = {
-                "velocity_limit": self.joint_velocity,
-                "effort_limit": self.robot.effort_limit,
-            }
-            absent = [f"{name}=…" for name, limit in limits.items() if (limit >= LARGEST).any()]
-            lacks = f"its joints lack limits: give {' and '.join(absent)}; or " if absent else ""
             raise SimulationDivergedError(
-                f"the simulation of arm {first} diverged {self._time[first]:.3f} s after its reset; {lacks}a shorter "
+                f"the simulation of arm {first} diverged {self._time[first]:.3f} s after its reset; a shorter "
                 "physics_step may help, or on_divergence='truncate' to end such episodes"
             )
 

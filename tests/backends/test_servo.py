@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from gym_mara.backends.servo import (
 from gym_mara.robot import RobotModel
 from gym_mara.state import Contact
 from gym_mara.types import Floats
-from tests.helpers import upright_arm, write
 
 GAIN, LIMIT = np.array([10.0]), np.array([1.57])
 angles = st.floats(-3.0, 3.0)
@@ -122,19 +120,6 @@ def test_an_arm_that_diverges_is_an_error_by_default(mara: RobotModel) -> None:
         backend.step(np.array([np.zeros(6), np.ones(6)]))
     assert np.isfinite(backend.state.qd).all()
     assert backend.state.diverged is None
-
-
-def test_the_error_asks_for_limits_that_the_joints_lack(tmp_path: Path) -> None:
-    text = (
-        upright_arm()
-        .replace('effort="50"', 'effort="1e9"')
-        .replace('velocity="2"', 'velocity="1e9"')
-    )
-    robot = RobotModel.load(write(tmp_path / "arm.urdf", text), "tool")
-    backend = IdealEngine(robot, 1)
-    asked = r"lack limits: give velocity_limit=… and effort_limit=…; or a shorter physics_step"
-    with pytest.raises(SimulationDivergedError, match=asked):
-        backend.step(np.ones((1, 3)))
 
 
 def test_contacts_right_after_a_reset_are_those_of_the_engine(mara: RobotModel) -> None:
