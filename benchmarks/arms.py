@@ -26,7 +26,7 @@ import gym_mara
 from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.diagnosis.sampling import Poses
+from gym_mara.robot.joint_ranges import reachable_range
 
 ACTIONS, POSES, STEPS = 50, 1000, 100
 AWAY, SPEED = 0.2, 1.0
@@ -122,7 +122,7 @@ def measure(arm: dict[str, Any], seconds: float) -> Iterator[tuple[str, str]]:
     hulls = options | {"convex_hulls": True}
     yield "load", f"{first:.2f}"
     yield "again", f"{second:.2f}"
-    q = Poses(robot, ()).configurations(POSES)
+    q = np.random.default_rng(0).uniform(*reachable_range(robot), (POSES, robot.num_joints))
     yield "collides", f"{100 * make_checker('coal', robot).check(q).mean():.0f} %"
     measures: dict[str, Callable[[], str]] = {
         "pinocchio": lambda: rate(robot, "pinocchio", seconds),
