@@ -2,18 +2,17 @@
 
 A record is a CSV file. Its first line is a comment with the environment, the backend and the options. Then follows one
 row per state: the arm's configuration, the terms of the reward, and the reward. A check reads the states from the
-record, so that its result depends only on the code under test. A relative path of a robot is relative to the record.
+record, so that its result depends only on the code under test. Relative paths of a robot and of its
+packages are relative to the record.
 """
 
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
@@ -26,7 +25,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import DamagedFileError, parsed_json, read_text, write_text
 from gym_mara.robot.inverse_kinematics import solve_ik
-from gym_mara.robot.model import is_path
+from gym_mara.robot.options import ROBOT_KEYWORDS, with_paths
 from gym_mara.types import Floats
 
 MOST_STATES = 100_000
@@ -182,8 +181,8 @@ def write(file: Path, recorded: Record) -> None:
             raise GymMaraError(
                 f"{name} is {column[state]} in state {state}; a record needs numbers"
             )
-    options = _with_robot(recorded.options, lambda path: os.path.relpath(path, file.parent))
-    about = dataclasses.asdict(_About(recorded.env, recorded.backend, options))
+    options = with_paths(recorded.options, lambda path: os.path.relpath(path, file.parent))
+    about = vars(_About(recorded.env, recorded.backend, options))
     text = io.StringIO()
     text.write(_HEADER + json.dumps(about, default=_plain) + "\n")
     writer = csv.writer(text, lineterminator="\n")
@@ -216,7 +215,7 @@ def read(file: Path) -> Record:
     rows = [_row(file, number, line, len(names)) for number, line in enumerate(lines[1:], start=3)]
     columns = np.array(rows).T
     values = dict(zip(names[joints:], columns[joints:], strict=True))
-    options = _with_robot(about.options, lambda path: os.path.join(file.parent, path))
+    options = with_paths(about.options, lambda path: os.path.join(file.parent, path))
     return Record(about.env, about.backend, options, columns[:joints].T, values)
 
 
@@ -242,14 +241,6 @@ def _joint_names(number: int) -> list[str]:
     return [f"q{joint + 1}" for joint in range(number)]
 
 
-def _with_robot(options: dict[str, Any], moved: Callable[[str], str]) -> dict[str, Any]:
-    """Options in which a relative path of a robot is replaced."""
-    robot = options.get("robot")
-    if not is_path(robot) or os.path.isabs(robot):
-        return options
-    return {**options, "robot": moved(os.fspath(robot))}
-
-
 def _plain(value: Any) -> Any:
     """An option as a value that JSON knows."""
     if isinstance(value, (np.ndarray, np.generic)):
@@ -269,7 +260,7 @@ def _check_tolerance(tolerance: float) -> None:
 
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
     """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
-    known = {"robot", "ee_frame", *task_keywords(env), *backend_settings(backend)} - {"workers"}
+    known = {*ROBOT_KEYWORDS, *task_keywords(env), *backend_settings(backend)} - {"workers"}
     for name in options:
         if name not in known:
             raise unknown("keyword argument", name, known, " of a reward record")

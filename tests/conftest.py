@@ -17,7 +17,7 @@ from hypothesis import settings
 
 from gym_mara.agents.experiments.executor import ONE_THREAD
 from gym_mara.robot import RobotModel
-from tests.helpers import robot_model, write
+from tests.helpers import Cli, robot_model, write
 
 # Tests run in several processes, and start more of them. All share the cores, so each uses one thread.
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
@@ -75,6 +75,17 @@ def _new_children(before: set[psutil.Process]) -> list[psutil.Process]:
 def mara() -> RobotModel:
     """MARA, loaded once, because a RobotModel is immutable."""
     return robot_model("mara")
+
+
+@pytest.fixture
+def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
+    """The command."""
+    from gym_mara.cli import common  # only these tests need it
+
+    monkeypatch.setenv("COLUMNS", "200")  # for the help
+    for console in (common.out, common.err):
+        monkeypatch.setattr(console, "width", 200)
+    return Cli(monkeypatch, capsys)
 
 
 @pytest.fixture

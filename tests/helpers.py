@@ -1,4 +1,4 @@
-"""Helpers of the tests: cached robots, configurations, golden values, small URDFs, processes."""
+"""Helpers of the tests: cached robots, configurations, golden values, small URDFs, processes, the command."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from gym_mara import cli
 from gym_mara.robot import RobotModel
 
 Floats = NDArray[np.float64]
@@ -98,6 +100,37 @@ def urdf_xml(*joints: str) -> str:
     return f'<robot name="stick">{links}{"".join(joints)}</robot>'
 
 
+def upright_arm(extra: str = "") -> str:
+    """The URDF of an arm of three joints, j1 about z, j2 and j3 about y, on a box; its links are base, l1, l2, l3 and tool.
+
+    Args:
+        extra: more elements.
+    """
+    moving = "".join(
+        f"""
+      <link name="l{number}">
+        <inertial><origin xyz="0 0 0.15"/><mass value="1"/>
+          <inertia ixx="0.01" iyy="0.01" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial>
+        <collision><origin xyz="0 0 0.15"/><geometry><box size="0.06 0.06 0.22"/></geometry></collision>
+      </link>
+      <joint name="j{number}" type="revolute">
+        <parent link="{"base" if number == 1 else f"l{number - 1}"}"/><child link="l{number}"/>
+        <origin xyz="0 0 {0.02 if number == 1 else 0.3}"/><axis xyz="{"0 0 1" if number == 1 else "0 1 0"}"/>
+        <limit lower="-2" upper="2" effort="50" velocity="2"/>
+      </joint>"""
+        for number in (1, 2, 3)
+    )
+    return f"""<robot name="upright">
+      <link name="base">
+        <collision><origin xyz="0 0 -0.05"/><geometry><box size="0.3 0.3 0.1"/></geometry></collision>
+      </link>{moving}
+      <link name="tool"/>
+      <joint name="jt" type="fixed">
+        <parent link="l3"/><child link="tool"/><origin xyz="0 0 0.3"/>
+      </joint>{extra}
+    </robot>"""
+
+
 def write(path: Path, text: str) -> Path:
     """Write a file and return its path."""
     path.write_text(text)
@@ -119,3 +152,19 @@ def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
+
+
+class Cli:
+    """Runs the command in this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+
+    def __call__(self, *arguments: object) -> tuple[int, str, str]:
+        """The exit code, the output and the error output."""
+        self._monkeypatch.setattr(sys, "argv", ["gym-mara", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            cli.main()
+        printed = self._capsys.readouterr()
+        code = exit_.value.code
+        return code if isinstance(code, int) else int(bool(code)), printed.out, printed.err

@@ -14,45 +14,20 @@ import pytest
 import typer
 from rich.console import Console
 
-from gym_mara import cli
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.agents.experiments.grid import Grid
-from gym_mara.cli import common, experiments
+from gym_mara.cli import experiments
 from gym_mara.cli.app import app
 from gym_mara.cli.common import whole
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
 from gym_mara.tasks import ReachTask, registry
+from tests.helpers import Cli
 
 
 def _commands() -> dict[str, Any]:
     """The commands by name."""
     return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-
-
-class Cli:
-    """Runs the command in this process."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch, self._capsys = monkeypatch, capsys
-
-    def __call__(self, *arguments: object) -> tuple[int, str, str]:
-        """The exit code, the output and the error output."""
-        self._monkeypatch.setattr(sys, "argv", ["gym-mara", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit_:
-            cli.main()
-        printed = self._capsys.readouterr()
-        code = exit_.value.code
-        return code if isinstance(code, int) else int(bool(code)), printed.out, printed.err
-
-
-@pytest.fixture
-def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    """The command."""
-    monkeypatch.setenv("COLUMNS", "200")  # for the help
-    for console in (common.out, common.err):
-        monkeypatch.setattr(console, "width", 200)
-    return Cli(monkeypatch, capsys)
 
 
 def test_list_shows_everything(gym_mara: Cli) -> None:

@@ -113,6 +113,7 @@ KEYWORDS = [
         "viewer_port",
         "viewer_host",
     ),
+    *("default_mass", "effort_limit", "velocity_limit", "package_dirs", "convex_hulls"),
     *("robt", "", "1", "a b", "__class__", "options"),
 ]
 SETTINGS = ["kappa=0.5", "max_joint_velocity=1", "robot=ur5", "on_collision=terminate", "robt=mara"]
@@ -140,6 +141,10 @@ VALID: dict[str, Sequence[str]] = {
     "out_folder": ["new", "new/deep"],
     "out_file": ["new.html"],
     "video": ["new.gif", "new.mp4"],
+    "file": ["mara", "ur5"],
+    "ee_frame": ["ee_link", "tool0"],
+    "picture": ["new.png"],
+    "write_srdf": ["new.srdf"],
     "record": ["new.csv"],
     "check": ["record.csv"],
     "settings": SETTINGS,

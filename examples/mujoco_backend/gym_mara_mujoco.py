@@ -11,8 +11,7 @@ from gym_mara.backends.servo import Motion, ServoBackend
 from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.kinematics import motion_axis
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact
 from gym_mara.types import Floats
@@ -75,8 +74,8 @@ class MujocoBackend(ServoBackend):
         )
         self._checker = make_checker("coal", robot)
         self._model = build_model(robot, self.physics_step)
-        # MuJoCo orders its constraints: first those of the joints' friction, then those of the motors.
-        first = np.count_nonzero(self._model.dof_frictionloss)
+        # MuJoCo orders its constraints: first those of joints that follow, of the joints' friction, then those of the motors.
+        first = len(robot.followers) + np.count_nonzero(self._model.dof_frictionloss)
         self._motors = slice(first, first + robot.num_joints)
         names = [shape.name for shape in robot.geometry.geometryObjects]
         geoms = [names.index(self._model.geom(index).name) for index in range(self._model.ngeom)]
@@ -87,8 +86,8 @@ class MujocoBackend(ServoBackend):
     def _run(self, velocities: Floats) -> Motion:
         runs = [self._run_arm(arm, velocities[:, index]) for index, arm in enumerate(self._arms)]
         return Motion(
-            q=np.array([arm.qpos for arm in self._arms]),
-            qd=np.array([arm.qvel for arm in self._arms]),
+            q=np.array([arm.qpos[: self.robot.num_joints] for arm in self._arms]),
+            qd=np.array([arm.qvel[: self.robot.num_joints] for arm in self._arms]),
             torque=np.array([torque for torque, _ in runs]),
             contacts=[contacts for _, contacts in runs],
         )
@@ -103,7 +102,7 @@ class MujocoBackend(ServoBackend):
         deepest: dict[tuple[str, str], float] = {}
         for velocity in velocities:
             # The motor's friction is made for a shaft at rest; this makes the shaft turn, see `_add_joint`.
-            arm.efc_aref[self._motors] = (velocity - arm.qvel) / self.physics_step
+            arm.efc_aref[self._motors] = (velocity - arm.qvel[: len(velocity)]) / self.physics_step
             mujoco.mj_step2(self._model, arm)
             torque = arm.efc_force[self._motors].copy()
             mujoco.mj_step1(self._model, arm)
@@ -113,7 +112,7 @@ class MujocoBackend(ServoBackend):
 
     def _contacts_of(self, arm: mujoco.MjData) -> list[Contact]:
         """MuJoCo's contacts where the arm is now; none where the links' meshes do not touch, although their hulls may."""
-        if arm.ncon == 0 or not self._checker.check(arm.qpos[None])[0]:
+        if arm.ncon == 0 or not self._checker.check(arm.qpos[None, : self.robot.num_joints])[0]:
             return []
         found = zip(arm.contact.geom.tolist(), arm.contact.dist.tolist(), strict=True)
         pairs = [(sorted(self._links[geom] for geom in geoms), dist) for geoms, dist in found]
@@ -129,7 +128,9 @@ class MujocoBackend(ServoBackend):
     def _set_state(self, arm: int, q: Floats, qd: Floats) -> None:
         data = self._arms[arm]
         mujoco.mj_resetData(self._model, data)
-        data.qpos[:], data.qvel[:] = q, qd
+        followers = self.robot.followers
+        data.qpos[:] = np.append(q, [each.position(q) for each in followers])
+        data.qvel[:] = np.append(qd, [each.velocity(qd) for each in followers])
         mujoco.mj_step1(self._model, data)
 
     def save(self) -> dict[str, Any]:
@@ -171,8 +172,8 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
     for number in range(1, robot.model.njoints):
         bodies.append(_add_joint(spec, robot, number, bodies[robot.model.parents[number]]))
     shapes = robot.geometry.geometryObjects
-    for shape in shapes:
-        _add_shape(spec, bodies[shape.parentJoint], robot.model, shape)
+    for geometry, shape in zip(shapes, robot.shapes, strict=True):
+        _add_shape(spec, bodies[geometry.parentJoint], geometry, shape)
     for pair in robot.geometry.collisionPairs:
         spec.add_pair(geomname1=shapes[pair.first].name, geomname2=shapes[pair.second].name)
     try:
@@ -180,18 +181,21 @@ def build_model(robot: RobotModel, physics_step: float) -> mujoco.MjModel:
     except ValueError as error:
         raise GymMaraError(f"MuJoCo cannot load the robot {robot.name!r}: {error}") from error
     # Here it is one number per joint in every version of MuJoCo; in MjSpec it is not.
-    model.dof_damping[:] = robot.model.damping
+    model.dof_damping[: robot.num_joints] = robot.model.damping
     return model
 
 
 def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
-    """Add a joint of Pinocchio's model, the body that it carries, and its motor; returns the body.
+    """Add a joint of Pinocchio's model, the body that it carries, and its motor or what it follows; returns the body.
 
     A motor acts like a clutch between the joint and a shaft that turns as commanded; it slips beyond the effort limit.
     It is modelled as friction on a tendon that only this joint pulls, so that MuJoCo's solver computes the motors' torques
     together with the contact forces.
     """
     name, inertia = robot.model.names[number], robot.model.inertias[number]
+    follows = number > robot.num_joints
+    if follows and inertia.mass <= 0.0:
+        inertia = pin.Inertia(1e-9, np.zeros(3), 1e-9 * np.eye(3))
     body = parent.add_body(
         mass=inertia.mass,
         ipos=inertia.lever,
@@ -199,16 +203,26 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
         explicitinertial=True,
         **_placed(robot.model.jointPlacements[number]),
     )
-    linear, angular = np.split(motion_axis(robot.model.joints[number]), 2)
+    linear, angular = np.split(robot.motion(number), 2)
     kind = mujoco.mjtJoint.mjJNT_HINGE if angular.any() else mujoco.mjtJoint.mjJNT_SLIDE
-    body.add_joint(
-        name=name,
-        type=kind,
-        axis=angular if angular.any() else linear,
-        limited=True,
-        range=(robot.lower[number - 1], robot.upper[number - 1]),
-        frictionloss=robot.model.friction[number - 1],
-    )
+    joint = body.add_joint(name=name, type=kind, axis=angular if angular.any() else linear)
+    # As hard as MuJoCo allows with this physics step.
+    hard = {"solref": (2.0 * spec.option.timestep, 1.0), "solimp": (_HARD, _HARD, 1.0, 0.5, 1.0)}
+    if follows:
+        follower = robot.followers[number - 1 - robot.num_joints]
+        spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=name,
+            name2=robot.joint_names[follower.leader],
+            data=[follower.offset, follower.multiplier, *[0.0] * (mujoco.mjNEQDATA - 2)],
+            **hard,
+        )
+        return body
+    joint.limited = True
+    joint.range = robot.lower[number - 1], robot.upper[number - 1]
+    joint.solref_limit, joint.solimp_limit = hard["solref"], hard["solimp"]
+    joint.frictionloss = robot.model.friction[number - 1]
     motor = spec.add_tendon(
         # MuJoCo makes no constraint for friction of zero.
         frictionloss=max(robot.effort_limit[number - 1], mujoco.mjMINVAL),
@@ -218,10 +232,10 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
     return body
 
 
-def _add_shape(spec: Any, body: Any, model: pin.Model, geometry: pin.GeometryObject) -> None:
-    """Add one of Pinocchio's geometry objects; it collides only in the pairs that `build_model` adds."""
+def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape) -> None:
+    """Add a shape where Pinocchio's geometry object is; it collides only in the pairs that `build_model` adds."""
     kinds, options = mujoco.mjtGeom, dict[str, Any]()
-    match shape_of(model, geometry):
+    match shape:
         case Box(size):
             options = {"type": kinds.mjGEOM_BOX, "size": 0.5 * size}
         case Sphere(radius):
@@ -230,10 +244,10 @@ def _add_shape(spec: Any, body: Any, model: pin.Model, geometry: pin.GeometryObj
             options = {"type": kinds.mjGEOM_CYLINDER, "size": (radius, 0.5 * length, 0.0)}
         case Capsule(radius, length):
             options = {"type": kinds.mjGEOM_CAPSULE, "size": (radius, 0.5 * length, 0.0)}
-        case Mesh(vertices=vertices):
+        case Mesh() as mesh:
             spec.add_mesh(
                 name=geometry.name,
-                uservert=vertices.ravel(),
+                uservert=mesh.vertices.ravel(),
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
             )
             options = {"type": kinds.mjGEOM_MESH, "meshname": geometry.name}

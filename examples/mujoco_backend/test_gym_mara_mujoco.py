@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from gym_mara_mujoco import MujocoBackend, build_model
 
 from gym_mara.backends import make_backend
@@ -20,6 +21,8 @@ from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import BackendContract, Make, uniform_q
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*below the weight of the arm")  # on purpose
 
 # A cart that carries a pole: a prismatic joint, other shapes, friction and damping. The hinge is too weak to hold the pole.
 SLIDER = """
@@ -120,6 +123,26 @@ def test_motors_and_joints_stay_within_their_limits(robot: RobotModel) -> None:
     assert (np.max(efforts, axis=(0, 1)) <= robot.effort_limit).all()
 
 
+@pytest.mark.filterwarnings("ignore:.*they touch in the start pose")
+def test_a_weak_arm_falls_onto_its_end_stop(tmp_path: Path) -> None:
+    path = tmp_path / "weak.urdf"
+    path.write_text(
+        SLIDER.replace('lower="-2" upper="2" effort="1"', 'lower="1" upper="2" effort="0.1"')
+    )
+    robot = RobotModel.from_urdf(path, ee_frame="pole")
+    backend = MujocoBackend(robot, 1)
+    backend.reset(np.array([[0.0, 1.8]]))
+    positions = []
+    for _ in range(100):
+        state = backend.step(np.array([[0.0, 1.8]]))
+        assert state.torque is not None
+        assert (np.abs(state.torque) <= robot.effort_limit).all()
+        np.testing.assert_array_equal(state.q[0], backend._arms[0].qpos)
+        positions.append(state.q[0, 1])
+    assert min(positions) >= 1.0 - backend.overshoot
+    np.testing.assert_allclose(positions[-10:], 1.0, atol=1e-3)
+
+
 def test_a_joint_moves_at_max_joint_velocity(mara: RobotModel) -> None:
     backend = MujocoBackend(mara, 1, max_joint_velocity=0.5)
     np.testing.assert_array_equal(backend.joint_velocity, 0.5)
@@ -175,6 +198,35 @@ def test_mujoco_has_a_contact_wherever_links_touch(robot: RobotModel) -> None:
         data.qpos[:] = row
         mujoco.mj_forward(model, data)
         assert data.ncon
+
+
+@pytest.mark.parametrize("scale", ["1 1 1", "-1 1.5 0.8"])
+def test_convex_hulls_touch_where_coal_says(tmp_path: Path, scale: str) -> None:
+    """MuJoCo takes the hull of every mesh, here of an L; Coal takes it with `convex_hulls`."""
+    legs = [trimesh.creation.box(size) for size in ((0.3, 0.1, 0.1), (0.1, 0.1, 0.3))]
+    legs[0].apply_translation((0.1, 0.0, 0.0))
+    legs[1].apply_translation((0.0, 0.0, 0.1))
+    trimesh.util.concatenate(legs).export(tmp_path / "part.stl")
+    mesh = f'<geometry><mesh filename="part.stl" scale="{scale}"/></geometry></collision>'
+    fixed = f'<link name="rail"><collision><origin xyz="0.3 0.5 0"/>{mesh}'
+    text = SLIDER.replace('<link name="rail">', fixed)
+    path = tmp_path / "slider.urdf"
+    path.write_text(text.replace("</inertial>", f"</inertial><collision>{mesh}"))
+    robot = RobotModel.from_urdf(path, ee_frame="pole", convex_hulls=True)
+    model = build_model(robot, 0.002)
+    data, q = mujoco.MjData(model), uniform_q(robot, 300, 0)
+    flags = make_checker("coal", robot).check(q)
+    geometry_data = robot.geometry.createData()
+    assert flags.any()
+    assert not flags.all()
+    for row, flag in zip(q, flags, strict=True):
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        if (data.ncon > 0) != flag:
+            pin.computeDistances(
+                robot.model, robot.model.createData(), robot.geometry, geometry_data, row
+            )
+            assert abs(min(r.min_distance for r in geometry_data.distanceResults)) < 1e-3
 
 
 def test_the_table_stops_the_arm(mara: RobotModel) -> None:
@@ -237,7 +289,7 @@ def test_a_state_that_diverges_is_an_error_or_ends_the_episode(
 def test_a_robot_without_inertia_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "massless.urdf"
     path.write_text(SLIDER.replace('<mass value="1"/>', '<mass value="0"/>'))
-    with pytest.raises(GymMaraError, match="MuJoCo cannot load the robot 'slider'"):
+    with pytest.raises(GymMaraError, match="link pole: no mass"):
         MujocoBackend(RobotModel.from_urdf(path, ee_frame="pole"), 1)
 
 
@@ -260,3 +312,20 @@ def test_arms_in_worker_processes_move_as_in_one(mara: RobotModel) -> None:
             np.testing.assert_array_equal(spread.step(targets).q, alone.step(targets).q)
     finally:
         spread.close()
+
+
+def test_a_joint_that_mimics_another_follows_it(tmp_path: Path) -> None:
+    bar = """
+      <joint name="bar" type="revolute"><parent link="rail"/><child link="bar"/><axis xyz="0 1 0"/>
+        <mimic joint="hinge" multiplier="-2" offset="0.1"/></joint>
+      <link name="bar"/>"""
+    (tmp_path / "slider.urdf").write_text(SLIDER.replace("</robot>", f"{bar}</robot>"))
+    robot = RobotModel.from_urdf(tmp_path / "slider.urdf", ee_frame="pole")
+    backend = MujocoBackend(robot, 1)
+    for target in np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2)):
+        for _ in range(10):
+            state = backend.step(target[None])
+            assert state.q.shape == (1, 2)
+            bar_q = backend._arms[0].qpos[2]
+            np.testing.assert_allclose(bar_q, -2.0 * state.q[0, 1] + 0.1, atol=1e-2)
+    assert abs(state.q[0, 1]) > 0.01

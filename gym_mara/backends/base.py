@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.errors import positive_number
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.types import Floats, Mask
@@ -25,18 +25,24 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms run faster in several processes: true for an engine that holds Python's lock while it steps."""
+    dynamic: ClassVar[bool] = False
+    """Whether masses and forces count, so that the robot's must be right."""
     most_arms: ClassVar[int] = 2**20
     """The largest number of arms: with more, an ordinary machine runs out of memory."""
     teleports: bool = False
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False
     """Whether parameters are drawn for each episode; if so `begin_episodes` is called before its reset."""
+    overshoot: float = 0.0
+    """How far joints may be beyond their limits, rad (m): with dynamics, end stops give way a little."""
     joint_velocity: Floats
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float
     """How long one step lasts, s."""
 
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
+        if self.dynamic:
+            robot.require_dynamics()
         self.robot = robot
         self.num_envs = num_envs
         self.control_period = positive_number(
@@ -89,3 +95,19 @@ class Backend(ABC):
 
     def close(self) -> None:  # noqa: B027 - most have nothing to free
         """Free the engine; no other method is called afterwards."""
+
+
+def limited_velocity(robot: RobotModel, max_joint_velocity: float) -> Floats:
+    """The highest velocity of each joint (J,), rad/s (m/s): `max_joint_velocity`, or the robot's limit where that is lower.
+
+    Raises:
+        GymMaraError: it is no positive number, or the robot's limit of a joint is zero.
+    """
+    limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
+    if not (robot.velocity_limit > 0.0).all():
+        joint = robot.joint_names[int((robot.velocity_limit > 0.0).argmin())]
+        raise GymMaraError(
+            f"joint {joint} of {robot.name} cannot move with max_joint_velocity, because its velocity limit is 0: correct the "
+            f"URDF, or give velocity_limit={{{joint!r}: …}}, rad/s (m/s)"
+        )
+    return np.minimum(limit, robot.velocity_limit)

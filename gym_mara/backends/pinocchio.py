@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.backends.base import Backend
+from gym_mara.backends.base import Backend, limited_velocity
 from gym_mara.collision import make_checker
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.cached import CachedChecker
 from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
-from gym_mara.errors import positive_number
+from gym_mara.errors import LARGEST, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
@@ -20,6 +20,8 @@ from gym_mara.types import Floats, Mask
 
 CACHE_FROM = 16
 """From this number of arms on a cached checker is faster."""
+_UNLIMITED = 1.0
+"""The velocity for the bounds of a joint without limit that teleports, rad/s (m/s)."""
 _STATE = ("q", "qd", "time", "collided", "touching")
 
 
@@ -27,20 +29,21 @@ class PinocchioBackend(Backend):
     """Kinematics without dynamics.
 
     By default the joints reach their targets within a step and rest there (gym-gazebo2's training mode). With
-    `max_joint_velocity` each joint moves at this velocity until it arrives (its run mode), and the arm stops where its
-    path first collides.
+    `max_joint_velocity` each joint moves at this velocity, or at the URDF's limit where that is lower, until it arrives (its run
+    mode), and the arm stops where its path first collides.
 
     Args:
         robot: the arm.
         num_envs: the number of arms.
         control_period: s.
-        max_joint_velocity: rad/s (m/s for a prismatic joint); None for joints that teleport.
+        max_joint_velocity: rad/s (m/s for a prismatic joint), where it is below the URDF's limits; None for joints that
+            teleport.
         collision: the collision engine: "coal" (the faster), "fcl", or "none" for no collisions.
         collision_threads: how many threads Coal uses; worth it for large batches on idle cores.
         path_resolution: the longest way of any point of the arm between two checks along a path, m.
 
     Raises:
-        GymMaraError: a setting is out of its range.
+        GymMaraError: a setting is out of its range, or a joint that does not teleport has a velocity limit of zero.
         MissingExtraError: the collision engine is not installed.
     """
 
@@ -56,12 +59,13 @@ class PinocchioBackend(Backend):
         path_resolution: float = 0.005,
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        self.max_joint_velocity = None
         self.teleports = max_joint_velocity is None
         if max_joint_velocity is not None:
-            velocity = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
-            self.max_joint_velocity = velocity
-            self.joint_velocity = np.full(robot.num_joints, velocity)
+            self.joint_velocity = limited_velocity(robot, max_joint_velocity)
+        else:  # the velocities are 0, but without a limit their bounds would be huge
+            limit = robot.velocity_limit
+            self.joint_velocity = np.where(limit < LARGEST, limit, _UNLIMITED)
+        self._furthest = self.joint_velocity * self.control_period
         self.path_resolution = positive_number(
             "path_resolution",
             path_resolution,
@@ -71,9 +75,8 @@ class PinocchioBackend(Backend):
         )
         self._checker = make_checker(collision, robot, collision_threads)
         self._with_margin: CollisionChecker | None = None
-        if self.max_joint_velocity is not None:
-            half = np.full(robot.num_joints, 0.5 * self.max_joint_velocity * self.control_period)
-            self._with_margin = self._checker.with_margin(half)
+        if not self.teleports:
+            self._with_margin = self._checker.with_margin(0.5 * self._furthest)
         elif num_envs >= CACHE_FROM and isinstance(
             self._checker, (CoalChecker, ParallelCoalChecker)
         ):
@@ -95,17 +98,17 @@ class PinocchioBackend(Backend):
         self._collided = None
 
     def step(self, q_target: Floats) -> SimState:
-        if self.max_joint_velocity is None:
+        if self.teleports:
             self._q[...] = q_target
             self._collided = self._checker.check(self._q)
         else:
-            self._travel(q_target, self.max_joint_velocity)
+            self._travel(q_target)
         self._time += self._period
         return self.state
 
-    def _travel(self, q_target: Floats, velocity: float) -> None:
+    def _travel(self, q_target: Floats) -> None:
         """Move along the path of one period, up to the first collision on it."""
-        way, furthest = q_target - self._q, velocity * self.control_period
+        way, furthest = q_target - self._q, self._furthest
         length = (np.minimum(np.abs(way), furthest) * self.robot.reach).sum(1)
         samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
         free = np.zeros(self.num_envs, np.bool_)
@@ -119,7 +122,7 @@ class PinocchioBackend(Backend):
         arm = np.repeat(np.arange(self.num_envs), samples)
         last = np.cumsum(samples) - 1
         sample = np.arange(1, len(arm) + 1) - (last - samples + 1)[arm]
-        limit = (furthest * (sample / samples[arm]))[:, None]
+        limit = furthest * (sample / samples[arm])[:, None]
         path = self._q[arm] + np.clip(way[arm], -limit, limit)
         arrived = np.abs(way[arm]) <= limit * (1.0 + 1e-9)
         path[arrived] = q_target[arm][arrived]  # exactly, without rounding
@@ -133,7 +136,7 @@ class PinocchioBackend(Backend):
         collided = first_hit <= last
         self._q = path[stop]
         resting = (self._q == q_target) | (collided & ~self._touching)[:, None]
-        self._qd = np.where(resting, 0.0, np.sign(way) * velocity)
+        self._qd = np.where(resting, 0.0, np.sign(way) * self.joint_velocity)
         self._collided, self._touching = collided, collided.copy()
 
     @property
@@ -141,7 +144,7 @@ class PinocchioBackend(Backend):
         if self._collided is None:
             self._collided = self._checker.check(self._q)
         position, quaternion = self._kinematics.pose(self._q)
-        if self.max_joint_velocity is None:  # at rest
+        if self.teleports:  # at rest
             velocity = np.zeros((self.num_envs, 3))
         else:
             velocity = self._kinematics.velocity(self._q, self._qd)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gym_mara.backends.base import Backend
+from gym_mara.backends.base import Backend, limited_velocity
 from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
@@ -44,7 +44,8 @@ class ServoBackend(Backend):
     """Full dynamics: gravity, inertia, contact, and motors with limits of velocity and effort.
 
     Each joint has a position servo: its motor is commanded the velocity clip(gain · (target - q), ± the limit of velocity)
-    at every physics step, and exerts what torque that takes, up to the effort limit. A subclass adds the engine: it
+    at every physics step, and exerts what torque that takes, up to the effort limit. Joints have end stops at their limits.
+    The state has the engine's joint positions, and its velocities clipped to the limits. A subclass adds the engine: it
     implements `_run`, `_put_at_rest` and `_rebuild`, and calls `reset` at the end of its constructor.
 
     Args:
@@ -60,6 +61,9 @@ class ServoBackend(Backend):
         GymMaraError: a setting is out of its range.
         SimulationDivergedError: from `step`, where an arm's state diverges and `on_divergence` is "error".
     """
+
+    dynamic = True
+    overshoot = 0.01
 
     def __init__(
         self,
@@ -84,8 +88,7 @@ class ServoBackend(Backend):
         self.physics_step = positive_number("physics_step", physics_step, "s")
         self._times = step_times(self.control_period, self.physics_step)[:, None, None]
         if max_joint_velocity is not None:
-            limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
-            self.joint_velocity = np.minimum(limit, robot.velocity_limit)
+            self.joint_velocity = limited_velocity(robot, max_joint_velocity)
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
         self._kinematics = robot.kinematics()
@@ -147,8 +150,7 @@ class ServoBackend(Backend):
 
     @property
     def state(self) -> SimState:
-        # Engines let joints slip past their limits by a little.
-        q = self._q.clip(self.robot.lower, self.robot.upper)
+        q = self._q.copy()
         qd = self._qd.clip(-self.joint_velocity, self.joint_velocity)
         position, quaternion = self._kinematics.pose(q)
         parameters = {name: values.copy() for name, values in self._parameters.items()}

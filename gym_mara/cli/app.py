@@ -8,7 +8,7 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from gym_mara.cli import FAILED, agents, environments, experiments, viewing
+from gym_mara.cli import FAILED, agents, environments, experiments, robots, viewing
 from gym_mara.cli.common import err, interruptible
 from gym_mara.errors import GymMaraError
 
@@ -40,6 +40,7 @@ app.command()(viewing.report)
 app.command()(experiments.benchmark)
 app.command()(experiments.plot)
 app.command()(experiments.search)
+app.command()(robots.robot)
 app.command("list")(environments.list_)
 app.command()(environments.rewards)
 
@@ -52,7 +53,8 @@ def run(arguments: list[str]) -> int:
     except typer.Abort:  # of Typer, for a Ctrl-C while it reads the arguments
         raise KeyboardInterrupt from None
     except GymMaraError as error:
-        return _failed(str(error))
+        broken = isinstance(error, robots.BrokenRobotError)  # which is what its command looks for
+        return _failed(str(error), 1 if broken else FAILED)
     except _UsageError as error:
         if not arguments:  # Typer's way to show the help
             error.show()
@@ -63,11 +65,11 @@ def run(arguments: list[str]) -> int:
         return _failed(message)
 
 
-def _failed(message: str) -> int:
+def _failed(message: str, code: int = FAILED) -> int:
     # A message may quote what a stranger's file holds: line breaks, and control characters, which a terminal obeys.
     line = " ".join(message.split())
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
     if len(line) > _LONGEST_MESSAGE:
         line = f"{line[:_LONGEST_MESSAGE]}…"
     err.print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
-    return FAILED
+    return code

@@ -24,7 +24,7 @@ from gym_mara.cli.common import (
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import environment, environment_id, environment_names
 from gym_mara.robot.catalog import robot_names
-from gym_mara.robot.modules import MODULES
+from gym_mara.robot.description.modules import MODULES
 from gym_mara.tasks import named_task
 
 

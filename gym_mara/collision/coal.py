@@ -9,6 +9,9 @@ import pinocchio as pin
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.robot import RobotModel
+from gym_mara.robot.bounds import joints_to
+from gym_mara.robot.description.shapes import Mesh
+from gym_mara.robot.geometry import coal_mesh
 from gym_mara.types import Floats, Mask
 
 
@@ -27,13 +30,14 @@ class CoalChecker(CollisionChecker):
         super().__init__(robot)
         self._displacement = displacement
         # The manager holds references to its arguments without keeping them alive.
-        self._data, self._geometry_data = robot.model.createData(), robot.geometry.createData()
+        self._geometry = robot.geometry if displacement is None else _with_hulls(robot)
+        self._data, self._geometry_data = robot.model.createData(), self._geometry.createData()
         if displacement is not None:
             margins = approach_bounds(robot, displacement).tolist()
             for request, margin in zip(self._geometry_data.collisionRequests, margins, strict=True):
                 request.security_margin = margin
         self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
-            robot.model, robot.geometry, self._geometry_data
+            robot.model, self._geometry, self._geometry_data
         )
 
     def check(self, q: Floats) -> Mask:
@@ -52,20 +56,32 @@ class CoalChecker(CollisionChecker):
         return type(self), (self.robot, self._displacement)
 
 
+def _with_hulls(robot: RobotModel) -> pin.GeometryModel:
+    """The robot's collision geometry with the convex hull of each mesh in its place.
+
+    Two hulls are never further apart than their meshes, and Coal finds their distance up to a thousand times faster.
+    """
+    if not any(isinstance(shape, Mesh) for shape in robot.shapes):
+        return robot.geometry
+    geometry = robot.geometry.copy()
+    for placed, shape in zip(geometry.geometryObjects, robot.shapes, strict=True):
+        if isinstance(shape, Mesh):
+            placed.geometry = coal_mesh(shape.hull)
+    return geometry
+
+
 def approach_bounds(robot: RobotModel, displacement: Floats) -> Floats:
     """By how much the distance of each collision pair can shrink (P,), m, while joints move by `displacement` (J,), rad.
 
     Only the joints between the two links of a pair move one relative to the other.
     """
-    model, objects = robot.model, robot.geometry.geometryObjects
-    joints_to: list[frozenset[int]] = [frozenset()]
-    for body in range(1, model.njoints):
-        joints_to.append(joints_to[model.parents[body]] | {body - 1})
-    length = robot.reach * displacement
+    objects = robot.geometry.geometryObjects
+    ways = [frozenset(joints_to(robot.model, body)) for body in range(robot.model.njoints)]
+    travel = robot.bounds.travel(displacement)
     bounds = []
     for pair in robot.geometry.collisionPairs:
-        one, other = (joints_to[objects[end].parentJoint] for end in (pair.first, pair.second))
-        bounds.append(length[sorted(one ^ other)].sum())
+        one, other = (ways[objects[end].parentJoint] for end in (pair.first, pair.second))
+        bounds.append(travel[sorted(one ^ other)].sum())
     return np.array(bounds)
 
 

@@ -8,19 +8,17 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.collision.base import CollisionChecker
-from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Sphere
 from gym_mara.types import Floats, Mask
 
 with needs("the collision engine 'fcl'", "fcl"):
     import fcl
-    import trimesh
 
 
 class FclChecker(CollisionChecker):
-    """python-fcl, with meshes as sets of triangles.
+    """python-fcl, with meshes as sets of triangles and convex hulls as solids.
 
     Args:
         robot: the arm.
@@ -60,7 +58,7 @@ class FclChecker(CollisionChecker):
 
 def _geometry(robot: RobotModel, index: int) -> Any:
     """python-fcl's geometry of one of the robot's shapes."""
-    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
+    match robot.shapes[index]:
         case Box(size):
             return fcl.Box(*size)
         case Sphere(radius):
@@ -69,14 +67,13 @@ def _geometry(robot: RobotModel, index: int) -> Any:
             return fcl.Cylinder(radius, length)
         case Capsule(radius, length):
             return fcl.Capsule(radius, length)
-        case Mesh(path, scale, convex=False):
-            mesh = trimesh.load_mesh(path)
+        case Mesh(convex=True) as hull:
+            # Solid, as in Coal. FCL wants the number of corners before each face's corners.
+            corners = np.column_stack([np.full(len(hull.faces), 3), hull.faces])
+            return fcl.Convex(hull.vertices, len(hull.faces), corners.ravel())
+        case Mesh() as mesh:
             model = fcl.BVHModel()
             model.beginModel(len(mesh.vertices), len(mesh.faces))
-            model.addSubModel(mesh.vertices * scale, mesh.faces)
+            model.addSubModel(mesh.vertices, mesh.faces)
             model.endModel()
             return model
-    raise GymMaraError(
-        f"the collision engine 'fcl' does not support the convex hull of link {robot.link_of(index)!r}; "
-        "use collision='coal'"
-    )

@@ -7,6 +7,7 @@ import numpy as np
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
+from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.types import Floats
 
 _TRIES = 10_000
@@ -23,7 +24,7 @@ class FreePoses:
         self._robot = robot
         self._checker = CoalChecker(robot)
         self._kinematics = robot.kinematics()
-        self._low, self._high = _range(robot)
+        self._low, self._high = reachable_range(robot)
 
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
         """Position (3,), m, and quaternion (4,), [w, x, y, z], at a configuration drawn uniformly from all free ones.
@@ -48,7 +49,7 @@ def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
     Always the same for a robot: the first of a fixed sequence, in the middle half of the joints' ranges, that is free
     and moves the tool away from home. The home pose where there is none.
     """
-    low, high = _range(robot)
+    low, high = reachable_range(robot)
     rng = np.random.default_rng(0)
     candidates = rng.uniform(0.75 * low + 0.25 * high, 0.25 * low + 0.75 * high, (256, len(low)))
     candidates = np.vstack([candidates, robot.home])
@@ -57,8 +58,3 @@ def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:
     good = ~CoalChecker(robot).check(candidates) & (away > 0.25 * away.max())
     chosen = int(good.argmax()) if good.any() else len(candidates) - 1
     return position[chosen], quaternion[chosen]
-
-
-def _range(robot: RobotModel) -> tuple[Floats, Floats]:
-    """The lowest and the highest configuration (J,), rad, that an action can ask for."""
-    return np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)

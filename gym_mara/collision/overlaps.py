@@ -13,7 +13,8 @@ import pinocchio as pin
 
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Shape, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from gym_mara.robot.joint_ranges import action_range
 from gym_mara.types import Floats, Mask
 
 _PAIRS = 4
@@ -78,8 +79,8 @@ class Overlaps:
         """The pairs that together find the most collisions of random actions, each the best of those left."""
         if not candidates:
             return []
-        joints = self._robot.num_joints
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, joints))
+        low, high = action_range(self._robot)
+        q = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
         q = q.clip(self._robot.lower, self._robot.upper)
         missed = CoalChecker(self._robot).check(q)
         enough = _WORTHWHILE * np.count_nonzero(missed)
@@ -99,17 +100,18 @@ class Overlaps:
 
 
 def _candidates(robot: RobotModel) -> list[_Pair]:
-    """Every ball in a moving shape with every fixed box that may collide with the shape, the outermost body first."""
+    """Every ball in a shape on the chain with every fixed box that may collide with it, the outermost body first."""
     objects = robot.geometry.geometryObjects
     found = []
     for pair in robot.geometry.collisionPairs:
-        ends = objects[pair.first], objects[pair.second]
-        for moving, fixed in (ends, ends[::-1]):
-            if moving.parentJoint == 0 or fixed.parentJoint != 0:
+        ends = pair.first, pair.second
+        for one, other in (ends, ends[::-1]):
+            moving, fixed = objects[one], objects[other]
+            if not 1 <= moving.parentJoint <= robot.num_joints or fixed.parentJoint != 0:
                 continue
-            box = shape_of(robot.model, fixed)
+            box = robot.shapes[other]
             if isinstance(box, Box):
-                ball = _ball(shape_of(robot.model, moving))
+                ball = _ball(robot.shapes[one])
                 if ball > 0.0:
                     found.append(_pair(moving, ball, fixed, box))
     return sorted(found, key=lambda pair: -pair.body)

@@ -78,7 +78,8 @@ class GazeboMaraEnv(MaraEnv):
             replacement = _position_for_velocity(self.simulation.robot)
             parts = self.simulation.observation.parts
             self.simulation.observation = Observation(
-                [replacement if part.name == replacement.name else part for part in parts]
+                [replacement if part.name == replacement.name else part for part in parts],
+                self.simulation.backend.overshoot,
             )
             self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
 

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
+from gym_mara.robot.joint_ranges import action_range
 from gym_mara.types import UnitActions
 
 
 def action_space(robot: RobotModel) -> Box[np.float32]:
-    """The actions of the paper, ±π for every revolute joint; of a prismatic joint the whole travel, m."""
-    prismatic = robot.kinematics().prismatic
-    low, high = np.where(prismatic, robot.lower, -np.pi), np.where(prismatic, robot.upper, np.pi)
+    """The space of an arm's actions (J,): joint targets, in the range of `action_range`."""
+    low, high = action_range(robot)
     return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 

@@ -73,12 +73,13 @@ class GoalSimulation(Simulation):
             "achieved_goal": achieved,
             "desired_goal": desired,
         }
-        self.observation = Observation([part for parts in groups.values() for part in parts])
+        overshoot = self.backend.overshoot
+        self.observation = Observation([p for parts in groups.values() for p in parts], overshoot)
         spaces: dict[str, Space[Any]] = {}
         self._columns: dict[str, slice] = {}
         start = 0
         for name, parts in groups.items():
-            box = Observation(parts).space
+            box = Observation(parts, overshoot).space
             spaces[name], self._columns[name] = box, slice(start, start + box.shape[0])
             start += box.shape[0]
         self.observation_space = Dict(spaces)

@@ -13,7 +13,7 @@ from gym_mara.backends import backend_names, backend_settings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.rendering import RenderSettings
-from gym_mara.robot import RobotLike, RobotModel
+from gym_mara.robot import RobotLike, RobotModel, RobotOptions
 from gym_mara.tasks import Task, named_task
 
 
@@ -47,7 +47,7 @@ class Options:
             robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
             ee_frame: the end-effector link of a URDF of your own.
             backend: the name of a backend.
-            keywords: values of the task, and settings of the backend, the sensors and the rendering.
+            keywords: values of the task and the robot, and settings of the backend, the sensors and the rendering.
             receiver: the class of the environment that received them, for the names in an error.
 
         Raises:
@@ -57,6 +57,7 @@ class Options:
         chosen = named_task(task)
         rooms = {
             "task": _names(chosen),
+            "robot": _names(RobotOptions),
             "backend": backend_settings(backend),
             "sensors": _names(SensorSettings),
             "rendering": _names(RenderSettings),
@@ -74,7 +75,7 @@ class Options:
             own[owners[0]][name] = value
         return cls(
             task=dataclasses.replace(chosen, **own["task"]),
-            robot=RobotModel.load(robot, ee_frame),
+            robot=RobotModel.load(robot, ee_frame, **own["robot"]),
             backend=backend,
             settings=own["backend"],
             sensors=SensorSettings(**own["sensors"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -82,8 +83,11 @@ class Simulation:
             )
         self._sensors = self._new_sensors()
         self.observation = Observation(
-            self.task.observation(self.robot, self.goal, self.backend.joint_velocity)
+            self.task.observation(self.robot, self.goal, self.backend.joint_velocity),
+            self.backend.overshoot,
         )
+        overshoot = self.backend.overshoot
+        self._observed_range = self.robot.lower - overshoot, self.robot.upper + overshoot
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
         self.action_space = action_space(self.robot)
@@ -238,6 +242,10 @@ class Simulation:
         """The observations (N, O) of a state; if there is noise, of what the sensors have measured."""
         if noise is not None:
             state = self._sensors.seen(state)
+        if (
+            self.backend.overshoot
+        ):  # an impact may take a joint further, but the observation stays in its space
+            state = dataclasses.replace(state, q=state.q.clip(*self._observed_range))
         return self.observation(state, self.goal)
 
     def _target(self, action: ArrayLike) -> Floats:

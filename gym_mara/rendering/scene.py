@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from gym_mara.extras import needs
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from gym_mara.types import Floats
 
 with needs("rendering", "render", "trimesh"):
@@ -69,18 +70,20 @@ class Scene:
     def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
         self._model, self._data = robot.model, robot.model.createData()
-        self._geometry = robot.visual
+        self._geometry, shapes = robot.visual
         self._geometry_data = self._geometry.createData()
         parts: list[Part] = []
         self._geometry_index: list[int] = []
-        for index, shape in enumerate(self._geometry.geometryObjects):
-            link = str(self._model.frames[shape.parentFrame].name)
-            for mesh, colour in _meshes_of(self._model, shape):
-                name = f"{shape.name}/{len(parts)}"
-                parts.append(_part(name, link, mesh, colour, fixed=shape.parentJoint == 0))
+        for index, placed in enumerate(self._geometry.geometryObjects):
+            link = str(self._model.frames[placed.parentFrame].name)
+            for mesh, colour in _meshes_of(placed, shapes[index]):
+                name = f"{placed.name}/{len(parts)}"
+                parts.append(_part(name, link, mesh, colour, fixed=placed.parentJoint == 0))
                 self._geometry_index.append(index)
         self._num_bodies = len(parts)
-        parts += _frame("target", 0.14, 0.006) + _frame("tool", 0.09, 0.003)
+        scale = _marker_scale(robot)
+        parts += _frame("target", 0.14 * scale, 0.006 * scale)
+        parts += _frame("tool", 0.09 * scale, 0.003 * scale)
         self.parts: tuple[Part, ...] = tuple(parts)
 
     def placements(self, view: View) -> Floats:
@@ -108,25 +111,50 @@ class Scene:
         pairs = zip(self.parts, self.placements(view), strict=True)
         return np.concatenate([part.placed(placement) for part, placement in pairs], dtype=float)
 
+    def swept(self, q: Floats) -> Floats:
+        """Where the arm is at configurations (N, J): the corners of boxes around its moving bodies (V, 3), m, in the world frame."""
+        vertices: dict[int, list[NDArray[np.float32]]] = {}
+        for part, index in zip(self.parts, self._geometry_index, strict=False):
+            placed = self._geometry.geometryObjects[index]
+            if not part.fixed:
+                own = part.placed(placed.placement.homogeneous)
+                vertices.setdefault(placed.parentJoint - 1, []).append(own)
+        if not vertices:
+            return np.empty((0, 3))
+        bodies = sorted(vertices, reverse=True)
+        boxes = [_corners(np.concatenate(vertices[body])) for body in bodies]
+        of_corners = np.repeat(bodies, 8).tolist()
+        points = self.robot.kinematics().points(q, of_corners, np.concatenate(boxes))
+        return points.reshape(-1, 3)
 
-def _meshes_of(
-    model: pin.Model, visual: pin.GeometryObject
-) -> list[tuple[trimesh.Trimesh, Colour]]:
-    """The meshes of a URDF visual, in its frame, each with its colour."""
-    red, green, blue, _ = np.asarray(visual.meshColor, float).tolist()
+
+def _corners(points: NDArray[np.float32]) -> Floats:
+    """The corners (8, 3) of the box around points (V, 3), along the axes."""
+    ends = np.array([points.min(axis=0), points.max(axis=0)], float)
+    return np.array(list(itertools.product(*ends.T)))
+
+
+def _marker_scale(robot: RobotModel) -> float:
+    """The size of the markers relative to those of MARA, which is 1.2 m long; to two digits, so that MARA's is 1."""
+    turning = robot.reach[~robot.kinematics().prismatic]
+    return float(f"{(turning.max() if len(turning) else robot.extent) / 1.2:.2g}")
+
+
+def _meshes_of(placed: pin.GeometryObject, shape: Shape) -> list[tuple[trimesh.Trimesh, Colour]]:
+    """The meshes of a visual shape, in its frame, each with its colour."""
+    red, green, blue, _ = np.asarray(placed.meshColor, float).tolist()
     own: Colour = (red, green, blue)
-    shape = shape_of(model, visual)
     if not isinstance(shape, Mesh):
         return [(_with_creases(_primitive(shape)), own)]
-    found = []
-    for mesh in trimesh.load_scene(shape.path).dump():
-        if isinstance(mesh, trimesh.Trimesh):
-            mesh.apply_scale(shape.scale)
-            colour = own if visual.overrideMaterial else _colour_of(mesh)
-            # STL stores no vertex normals, so creases are found by angle; the other formats store them.
-            is_stl = shape.path.lower().endswith(".stl")
-            found.append((_with_creases(mesh) if is_stl else mesh, colour))
-    return found
+    # STL and hulls have no vertex normals, so creases are found by angle; the other formats store them.
+    unshaded = shape.convex or shape.path.lower().endswith(".stl")
+    return [
+        (
+            _with_creases(part) if unshaded else part,
+            own if placed.overrideMaterial else _colour_of(part),
+        )
+        for part in shape.parts
+    ]
 
 
 def _primitive(shape: Box | Sphere | Cylinder | Capsule) -> trimesh.Trimesh:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gym_mara.robot.description.shapes import Mesh
 from gym_mara.robot.kinematics import motion_axis
 from gym_mara.robot.model import RobotModel
-from gym_mara.robot.shapes import Mesh, shape_of
 
 _DECIMALS = 9
 """Numbers are rounded, because a library computes the last digits differently on another machine."""
@@ -22,9 +22,6 @@ def fingerprint(robot: RobotModel) -> str:
     These are the placements, axes, limits and inertias of its joints, its home pose, its end-effector frame, its collision
     shapes with the vertices of their meshes, and the pairs of links that may collide. Comments and the places of files do
     not count.
-
-    Raises:
-        GymMaraError: a collision shape has an unknown type.
     """
     digest = hashlib.sha256()
 
@@ -40,10 +37,11 @@ def fingerprint(robot: RobotModel) -> str:
     add(model.friction, model.damping, model.armature)
     for joint, placement in zip(model.joints[1:], model.jointPlacements[1:], strict=True):
         add(placement.homogeneous, motion_axis(joint))
+    for follower in robot.followers:
+        add(follower.name, *follower[1:])
     for inertia in model.inertias:
         add(inertia.mass, inertia.lever, inertia.inertia)
-    for geometry_object in robot.geometry.geometryObjects:
-        shape = shape_of(model, geometry_object)
+    for geometry_object, shape in zip(robot.geometry.geometryObjects, robot.shapes, strict=True):
         add(
             type(shape).__name__, geometry_object.parentJoint, geometry_object.placement.homogeneous
         )

@@ -64,11 +64,12 @@ def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tupl
 def _starts(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
     """Where to start from (S, J): home, then fixed random configurations, the nearest to the pose first."""
     kinematics = robot.kinematics()
-    # One turn of a revolute joint is enough; a prismatic joint needs its whole range, if that is finite.
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    whole = np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    whole &= kinematics.prismatic | (low > high)
-    low, high = np.where(whole, robot.lower, low), np.where(whole, robot.upper, high)
+    # One turn of a revolute joint is enough, that around zero if it is within the limits; a prismatic joint needs its
+    # whole travel.
+    high = np.minimum(robot.upper, np.maximum(robot.lower, -np.pi) + 2.0 * np.pi)
+    low = np.maximum(robot.lower, high - 2.0 * np.pi)
+    slides = kinematics.prismatic & np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    low, high = np.where(slides, robot.lower, low), np.where(slides, robot.upper, high)
     random = np.random.default_rng(0).uniform(low, high, (_STARTS, robot.num_joints))
     positions, quaternions = kinematics.pose(random)
     distance = np.linalg.norm(positions - position, axis=1)

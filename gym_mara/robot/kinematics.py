@@ -22,7 +22,7 @@ BATCH_FROM = 24
 
 
 class Kinematics:
-    """The forward kinematics of a Pinocchio model that is one chain of J revolute and prismatic joints.
+    """The forward kinematics of a chain of J revolute and prismatic joints, the first of a Pinocchio model.
 
     An instance has buffers of its own and must not be shared between threads.
 
@@ -34,7 +34,8 @@ class Kinematics:
     def __init__(self, model: pin.Model, ee_frame_id: int) -> None:
         self._model, self._data, self._frame = model, model.createData(), ee_frame_id
         self._tool: Floats = model.frames[ee_frame_id].placement.homogeneous[None]
-        motions = np.array([motion_axis(joint) for joint in model.joints[1:]])
+        chain = slice(1, 1 + model.nq)  # joints that mimic others come after it
+        motions = np.array([motion_axis(joint) for joint in model.joints[chain]])
         self.prismatic: Mask = np.logical_not(np.any(motions[:, 3:], axis=1))
         """Which joints are prismatic (J,)."""
         self._any_prismatic = bool(self.prismatic.any())
@@ -49,7 +50,7 @@ class Kinematics:
                 terms[1, :3, 3] = axis
             else:
                 terms[1, :3, :3], terms[2, :3, :3] = np.eye(3) - along, pin.skew(axis)
-        placements = np.array([p.homogeneous for p in model.jointPlacements[1:]])
+        placements = np.array([p.homogeneous for p in model.jointPlacements[chain]])
         self._terms = (placements[:, None] @ local).reshape(len(motions), 3, 16)
         self._buffers: dict[int, tuple[Floats, Floats]] = {}
 
@@ -143,7 +144,10 @@ class Kinematics:
 
 
 def motion_axis(joint: pin.JointModel) -> Floats:
-    """The motion subspace (6,) of a one-dimensional joint in its own frame: linear part, then angular."""
+    """The motion subspace (6,) of a one-dimensional joint in its own frame: linear part, then angular.
+
+    For a joint that mimics another it is the motion per unit of the other.
+    """
     data = joint.createData()
-    joint.calc(data, np.zeros(joint.idx_q + joint.nq))
+    joint.calc(data, np.zeros(joint.idx_q + 1))
     return np.array(data.S).reshape(6)

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import warnings
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
-from gym_mara.robot.collision_pairs import link_of, set_collision_pairs
-from gym_mara.robot.kinematics import Kinematics
-from gym_mara.robot.modules import EE_FRAME, MARA, compose
-from gym_mara.robot.srdf import Semantics, read_srdf, read_xml
-from gym_mara.robot.urdf import build, check_urdf, ee_frame_among_links, make_chain, visual_geometry
+from gym_mara.robot.bounds import Bounds
+from gym_mara.robot.collision_pairs import Pair, link_of
+from gym_mara.robot.description.off_chain import Follower
+from gym_mara.robot.description.shapes import Shape
+from gym_mara.robot.description.target import Target
+from gym_mara.robot.diagnosis import Finding, raise_errors, warn
+from gym_mara.robot.geometry import Geometry, read_geometry
+from gym_mara.robot.kinematics import Kinematics, motion_axis
+from gym_mara.robot.loading import from_files, from_modules, read_only, with_notes
+from gym_mara.robot.options import RobotOptions, is_path
 from gym_mara.types import Floats
 
 
@@ -40,6 +44,8 @@ class RobotModel:
     """The URDF as text, with all joints off the chain fixed."""
     ee_frame: str
     joint_names: tuple[str, ...]
+    followers: tuple[Follower, ...]
+    """The joints off the chain that mimic one of it; in `model` they come after the chain, in this order."""
     lower: Floats
     """Lower position limits, rad (m for a prismatic joint)."""
     upper: Floats
@@ -49,33 +55,68 @@ class RobotModel:
     """Nm (N)."""
     home: Floats
     """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
-    collision_pairs: frozenset[frozenset[str]]
+    collision_pairs: frozenset[Pair]
     """The pairs of links that may collide."""
+    excluded_pairs: Mapping[Pair, str]
+    """The other pairs of links on different bodies, and why they are never checked."""
+    target: Target | None
+    """The default target, from the file NAME.target.json beside NAME.urdf; None if there is no such file."""
     model: pin.Model
     """Pinocchio's model, its joints those of `joint_names`."""
     geometry: pin.GeometryModel
     """Pinocchio's collision geometry, with its collision pairs set."""
+    shapes: tuple[Shape, ...]
+    """The collision shapes, those of `geometry.geometryObjects`."""
+    options: RobotOptions
+    """What was added to the files."""
+    findings: tuple[Finding, ...]
+    """What is wrong with the files."""
+    _unwarned: bool = field(default=False, init=False)
+    """Whether the warnings for backends with dynamics are still to come."""
 
     @classmethod
-    def load(cls, robot: RobotLike | Path, ee_frame: str | None = None) -> RobotModel:
+    def load(
+        cls, robot: RobotLike | Path, ee_frame: str | None = None, **options: Any
+    ) -> RobotModel:
         """Load a robot by its name ("mara", "ur5", …), the path of its URDF, or a list of modules.
 
-        A RobotModel is returned as it is.
+        A RobotModel is returned as it is. Warns of what is probably not meant, see `findings`.
 
         Args:
-            robot: the robot. A path ends in ".urdf" or ".xml"; an SRDF of the same name beside it is read too.
+            robot: the robot. A path ends in ".urdf" or ".xml"; NAME.srdf and NAME.target.json beside NAME.urdf are read
+                too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
+            **options: fields of `RobotOptions`.
 
         Raises:
-            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
+            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm that can move.
+            MissingExtraError: the robot's files come with a package that is not installed.
+        """
+        loaded = cls.inspect(robot, ee_frame, **options)
+        return loaded if loaded is robot else loaded._checked()
+
+    @classmethod
+    def inspect(
+        cls, robot: RobotLike | Path, ee_frame: str | None = None, **options: Any
+    ) -> RobotModel:
+        """Load a robot as `load` does, but neither raise nor warn by its findings.
+
+        Raises:
+            GymMaraError: the robot cannot be read at all.
             MissingExtraError: the robot's files come with a package that is not installed.
         """
         if ee_frame is not None and not isinstance(ee_frame, str):
             raise GymMaraError(f"ee_frame must be the name of a link, not {ee_frame!r}")
         if isinstance(robot, RobotModel):
+            if ee_frame is not None or options:
+                given = ", ".join([*(["ee_frame"] if ee_frame is not None else []), *options])
+                raise GymMaraError(
+                    f"{given} cannot change a RobotModel; give it to RobotModel.load, which made the model"
+                )
             return robot
+        own = RobotOptions(**options)
         if isinstance(robot, (list, tuple)):
-            return cls.from_modules(robot)
+            return from_modules(cls, robot, own)
         if not isinstance(robot, (str, Path)):
             raise GymMaraError(
                 f"robot must be a name, the path of a URDF, a list of modules or a RobotModel, not {robot!r}"
@@ -83,9 +124,16 @@ class RobotModel:
         if isinstance(robot, Path) or is_path(robot):
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")
-            return cls.from_urdf(path, ee_frame, srdf if srdf.is_file() else None)
+            srdf_there = srdf if srdf.is_file() else None
+            return from_files(cls, path, ee_frame, srdf_there, None, own)
+        if robot not in catalog.robot_names() and robot and os.path.lexists(robot):
+            raise GymMaraError(
+                f"robot={robot!r} is no robot's name; for the file of that name write {os.path.join('.', robot)!r}"
+            )
         files = catalog.find(robot)
-        return cls._from_files(files.urdf, ee_frame or files.ee_frame, files.srdf, robot)
+        frame = ee_frame or files.ee_frame
+        found = from_files(cls, files.urdf, frame, files.srdf, robot, own)
+        return with_notes(found)
 
     @classmethod
     def from_urdf(
@@ -95,10 +143,11 @@ class RobotModel:
         srdf: Path | str | None = None,
         *,
         name: str | None = None,
+        **options: Any,
     ) -> RobotModel:
         """Load an arm from your own files.
 
-        Meshes are looked for beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
+        Meshes are looked for in `package_dirs`, beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
         Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables
         pairs of links.
 
@@ -107,86 +156,37 @@ class RobotModel:
             ee_frame: the end-effector link; by default the one that the SRDF names.
             srdf: path of the SRDF file: disabled collisions, home pose, end effector.
             name: the robot's name; by default the one in the URDF.
+            **options: fields of `RobotOptions`.
 
         Raises:
             GymMaraError: a file is missing or broken, the frame does not exist, or no fixed-base chain leads to it.
 
-        Warns if the SRDF names links or joints that the URDF lacks.
+        Warns of what is probably not meant, see `findings`.
         """
-        return cls._from_files(Path(urdf), ee_frame, Path(srdf) if srdf else None, name, warn=True)
+        own = RobotOptions(**options)
+        found = from_files(cls, Path(urdf), ee_frame, Path(srdf) if srdf else None, name, own)
+        return found._checked()
 
     @classmethod
-    def _from_files(
-        cls,
-        urdf: Path,
-        ee_frame: str | None,
-        srdf: Path | None,
-        name: str | None,
-        *,
-        warn: bool = False,
-    ) -> RobotModel:
-        root = read_xml(urdf, "URDF")
-        semantics = read_srdf(srdf) if srdf else Semantics()
-        unknown = semantics.unknown_names(root)
-        if warn and unknown:
-            warnings.warn(
-                f"{str(srdf)!r} names links or joints that {str(urdf)!r} lacks; they are ignored: "
-                f"{', '.join(unknown)}. Correct them, unless the SRDF describes a larger robot",
-                stacklevel=3,
-            )
-        ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
-        return cls._from_xml(root, semantics, ee_frame, name, urdf, srdf)
-
-    @classmethod
-    def from_modules(cls, modules: Sequence[str]) -> RobotModel:
+    def from_modules(cls, modules: Sequence[str], **options: Any) -> RobotModel:
         """Compose an arm of 3 to 7 joints from MARA's modules, on MARA's table.
 
         Args:
             modules: from "base" to "tool"; between them "motor_large", "motor_medium", "motor_small", "link_straight" and
                 "link_bent", in any number and order in which their faces fit. A motor makes a joint at each of its faces.
+            **options: fields of `RobotOptions`.
 
         Raises:
             GymMaraError: a module is unknown or does not fit, or the arm has too few or too many joints.
         """
-        urdf = catalog.find("mara").urdf
-        root = compose(urdf, modules)
-        name = "mara" if tuple(modules) == MARA else None
-        return cls._from_xml(root, Semantics(), EE_FRAME, name, urdf, None, tuple(modules))
+        return from_modules(cls, modules, RobotOptions(**options))
 
-    @classmethod
-    def _from_xml(
-        cls,
-        root: ElementTree.Element,
-        semantics: Semantics,
-        ee_frame: str,
-        name: str | None,
-        urdf: Path,
-        srdf: Path | None,
-        modules: tuple[str, ...] = (),
-    ) -> RobotModel:
-        check_urdf(urdf, root)
-        chain = make_chain(urdf, root, ee_frame)
-        xml = ElementTree.tostring(root, encoding="unicode")
-        model, geometry = build(urdf, xml)
-        limits = model.lowerPositionLimit, model.upperPositionLimit
-        home = np.clip(semantics.home(chain), *limits)
-        return cls(
-            name=name or root.get("name") or urdf.stem,
-            urdf=urdf,
-            srdf=srdf,
-            modules=modules,
-            xml=xml,
-            ee_frame=ee_frame,
-            joint_names=tuple(model.names)[1:],
-            lower=_read_only(model.lowerPositionLimit),
-            upper=_read_only(model.upperPositionLimit),
-            velocity_limit=_read_only(model.velocityLimit),
-            effort_limit=_read_only(model.effortLimit),
-            home=_read_only(home),
-            collision_pairs=set_collision_pairs(root, semantics, model, geometry, home),
-            model=model,
-            geometry=geometry,
-        )
+    def _checked(self) -> RobotModel:
+        """This robot; raises and warns by its findings, in the name of the caller of the calling method."""
+        raise_errors(self.name, self.findings, dynamics=False)
+        warn(repr(str(self.urdf)), self.findings, dynamics=False, stacklevel=3)
+        object.__setattr__(self, "_unwarned", True)
+        return self
 
     @property
     def num_joints(self) -> int:
@@ -200,9 +200,32 @@ class RobotModel:
         return int(self.model.getFrameId(self.ee_frame, pin.FrameType.BODY))
 
     @cached_property
-    def visual(self) -> pin.GeometryModel:
-        """Pinocchio's visual geometry, read on first use."""
-        return visual_geometry(self.urdf, self.xml, self.model)
+    def visual(self) -> Geometry:
+        """The visual shapes, read on first use; the collision shapes if the URDF has no others."""
+        visual = read_geometry(self.urdf, self.xml, self.model, "visual", self.options.package_dirs)
+        return visual if visual.shapes else Geometry(self.geometry, self.shapes)
+
+    def require_dynamics(self) -> None:
+        """Check that backends with dynamics can simulate this arm, and warn once of what is probably not meant.
+
+        Raises:
+            GymMaraError: they cannot; it says why, and what to do.
+        """
+        raise_errors(self.name, self.findings, dynamics=True)
+        if self._unwarned:
+            object.__setattr__(self, "_unwarned", False)
+            warn(repr(str(self.urdf)), self.findings, dynamics=True, stacklevel=2)
+
+    def motion(self, number: int) -> Floats:
+        """The motion subspace (6,) of a joint of `model`, in its own frame: linear part, then angular.
+
+        Args:
+            number: Pinocchio's index of the joint, from 1.
+        """
+        motion = motion_axis(self.model.joints[number])
+        if number > self.num_joints:  # Pinocchio gives it per unit of the leader
+            motion = motion / self.followers[number - 1 - self.num_joints].multiplier
+        return motion
 
     def kinematics(self) -> Kinematics:
         """The forward kinematics, a new instance for each caller."""
@@ -211,36 +234,17 @@ class RobotModel:
     @cached_property
     def reach(self) -> Floats:
         """A bound (J,) on how far any point of the arm moves per unit that a joint moves: m/rad, or 1 if prismatic."""
-        reach = np.zeros(self.num_joints)
-        for body, point in self._points():
-            for joint in range(body):
-                reach[joint] = max(reach[joint], self._lengths[joint + 1 : body].sum() + point)
-        reach[self.kinematics().prismatic] = 1.0
-        return _read_only(reach)
+        return read_only(self.bounds.reach)
 
-    @cached_property
+    @property
     def extent(self) -> float:
         """A bound on how far any point of the arm can be from the world's origin, m."""
-        return max(float(self._lengths[:body].sum() + point) for body, point in self._points())
+        return self.bounds.extent
 
     @cached_property
-    def _lengths(self) -> Floats:
-        """A bound (J,) on how far each joint's origin is from that of the joint before, m; the first from the world's."""
-        slides = self.kinematics().prismatic
-        span = np.where(slides, np.maximum(abs(self.lower), abs(self.upper)), 0.0)
-        return span + [np.linalg.norm(p.translation) for p in self.model.jointPlacements[1:]]
-
-    def _points(self) -> list[tuple[int, float]]:
-        """Bounds on how far the arm's points are from the joint that carries them: joint number, m."""
-        frame = self.model.frames[self.ee_frame_id]
-        points = [(int(frame.parentJoint), float(np.linalg.norm(frame.placement.translation)))]
-        for geometry_object in self.geometry.geometryObjects:
-            shape, body = geometry_object.geometry, geometry_object.parentJoint
-            if body > 0:
-                shape.computeLocalAABB()
-                centre = geometry_object.placement.act(shape.aabb_center)
-                points.append((body, float(np.linalg.norm(centre) + shape.aabb_radius)))
-        return points
+    def bounds(self) -> Bounds:
+        """How far the joints move the arm's points."""
+        return Bounds.of(self.model, self.geometry, self.ee_frame_id, self.followers)
 
     def link_of(self, geometry_index: int) -> str:
         """The name of the link that a collision shape belongs to, given the shape's index."""
@@ -273,8 +277,10 @@ class RobotModel:
     def __reduce__(self) -> tuple[Any, ...]:
         # Pinocchio's geometry does not pickle; a copy is loaded from the modules or the files.
         if self.modules:
-            return RobotModel.from_modules, (self.modules,)
-        return RobotModel._from_files, (self.urdf, self.ee_frame, self.srdf, self.name)
+            return from_modules, (RobotModel, self.modules, self.options, self.findings)
+        files = self.urdf, self.ee_frame, self.srdf, self.name
+        arguments = (RobotModel, *files, self.options, self.findings)
+        return from_files, arguments, {"_unwarned": self._unwarned}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:
         return self  # immutable
@@ -283,16 +289,5 @@ class RobotModel:
         return f"RobotModel({self.name!r}, joints={list(self.joint_names)}, ee_frame={self.ee_frame!r})"
 
 
-def is_path(robot: object) -> TypeGuard[str | Path]:
-    """Whether a robot is given by the path of its URDF."""
-    return isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith((".urdf", ".xml")))
-
-
 RobotLike = str | Sequence[str] | RobotModel
 """A robot's name, the path of its URDF, a list of modules, or a loaded robot."""
-
-
-def _read_only(values: Floats) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array

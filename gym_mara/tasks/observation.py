@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 _ONE = 1.0 + 1e-9
 """The bound of a unit quaternion's components, with a margin for rounding."""
 
+_NARROWEST = 1e-9
+"""The least difference of two bounds."""
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -32,6 +35,8 @@ class Part:
     """The upper bounds (K,)."""
     values: Callable[[SimState, Goal], Floats]
     """Computes the values (N, K) for N arms; a module-level function, so that environments can be pickled."""
+    joint_limits: bool = False
+    """Whether the bounds are joint limits, which joints with dynamics may overshoot."""
 
 
 class Observation:
@@ -39,12 +44,13 @@ class Observation:
 
     Args:
         parts: the parts, in order.
+        overshoot: by how much the bounds of parts with `joint_limits` are widened, rad (m): that of the backend.
 
     Raises:
         GymMaraError: two parts have the same name, or a part's bounds differ in shape.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[Part], overshoot: float = 0.0) -> None:
         names = [part.name for part in parts]
         if len(set(names)) < len(names):
             raise GymMaraError(f"two parts of an observation have the same name: {names}")
@@ -56,11 +62,11 @@ class Observation:
                 )
         self.parts = tuple(parts)
         self._values = [part.values for part in parts]
-        low, high = (
-            np.concatenate([part.low for part in parts]),
-            np.concatenate([part.high for part in parts]),
-        )
-        self.space = Box(low, high, dtype=np.float64)
+        wider = [overshoot if part.joint_limits else 0.0 for part in parts]
+        low = np.concatenate([part.low - by for part, by in zip(parts, wider, strict=True)])
+        high = np.concatenate([part.high + by for part, by in zip(parts, wider, strict=True)])
+        # Gymnasium warns of equal bounds, such as those of a joint that cannot move.
+        self.space = Box(low, np.maximum(high, low + _NARROWEST), dtype=np.float64)
         """The space of one flat observation (O,)."""
         self._ends = np.cumsum([len(part.low) for part in parts]).tolist()
 
@@ -79,7 +85,7 @@ class Observation:
 
 def joint_positions(robot: RobotModel) -> Part:
     """The joint positions (J,), rad (m for a prismatic joint)."""
-    return Part("joint_positions", robot.lower, robot.upper, _joint_positions)
+    return Part("joint_positions", robot.lower, robot.upper, _joint_positions, joint_limits=True)
 
 
 def position_error(robot: RobotModel, farthest: float) -> Part:

@@ -21,11 +21,6 @@ from gym_mara.types import Floats, Mask
 if TYPE_CHECKING:
     from gym_mara.robot import RobotModel
 
-# The default target of a robot: position (m), quaternion [w, x, y, z]. MARA's target is the one of gym-gazebo2: the
-# tool points straight down.
-_TARGETS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "mara": ((-0.40028, 0.095615, 0.72466), (0.0, 0.7071068, 0.7071068, 0.0)),
-}
 # The arm must be able to reach a target within this distance (m) and angle (rad), otherwise there is a warning.
 _REACH_TOLERANCE = (1e-3, 1e-2)
 # The smallest and the largest positive value of each constant of the reward, and whether it can be zero.
@@ -94,7 +89,8 @@ class ReachTask(Task):
         given = (self.target_position, self.target_quaternion)
         default: tuple[Any, Any] = (None, None)
         if None in given:
-            default = _TARGETS.get(robot.name) or workspace.default_pose()
+            own = robot.target
+            default = (own.position, own.quaternion) if own else workspace.default_pose()
         position, quaternion = (
             np.array(value if value is not None else fallback, dtype=np.float64)
             for value, fallback in zip(given, default, strict=True)

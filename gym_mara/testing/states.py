@@ -34,8 +34,8 @@ COPIES = (pytest.param(copy.deepcopy, id="deepcopy"), pytest.param(pickled, id="
 
 
 def uniform_q(robot: RobotModel, count: int, seed: int, furthest: float = np.pi) -> Floats:
-    """Random configurations (N, J) within the joint limits, each joint at most `furthest`, rad, from zero."""
-    low, high = np.maximum(robot.lower, -furthest), np.minimum(robot.upper, furthest)
+    """Random configurations (N, J) within the joint limits, each joint at most `furthest`, rad, from zero if it can."""
+    low, high = (np.clip(end, robot.lower, robot.upper) for end in (-furthest, furthest))
     return np.random.default_rng(seed).uniform(low, high, (count, robot.num_joints))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,19 +10,27 @@ import pinocchio as pin
 import pytest
 
 from gym_mara.backends import make_backend
-from gym_mara.backends.dart.arm import DETECTORS, DartArm
+from gym_mara.backends.dart.arm import DartArm
 from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.dart.shapes import DETECTORS
 from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.collision import make_checker
-from gym_mara.collision.coal import approach_bounds
+from gym_mara.collision.coal import CoalChecker, approach_bounds
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, assert_same_state, pickled, uniform_q
 from gym_mara.types import Floats
-from tests.helpers import robot_model
+from tests.helpers import robot_model, upright_arm, write
 
 # The path from home is free of collisions.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
+# A bar beside the second link, which turns with it, twice as far.
+BAR = """
+  <link name="bar">{}<collision><origin xyz="0 0 0.15"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>
+  <joint name="bar" type="revolute"><parent link="l1"/><child link="bar"/><origin xyz="-0.1 0 0.3"/><axis xyz="0 1 0"/>
+    <mimic joint="j2" multiplier="2" offset="-0.1"/></joint>"""
+BAR_INERTIAL = """
+  <inertial><mass value="0.2"/><inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>"""
 
 
 def _run(backend: DartBackend, target: Floats, steps: int) -> tuple[Floats, Floats]:
@@ -299,3 +308,39 @@ def test_an_arm_whose_state_diverges_is_reported_where_it_was_before(mara: Robot
     backend.restore(snapshot)
     assert backend.state.diverged is not None
     assert backend.state.diverged.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("inertial", ["", BAR_INERTIAL])
+def test_a_joint_that_mimics_another_follows_it_into_contacts(
+    tmp_path: Path, inertial: str
+) -> None:
+    robot = RobotModel.load(write(tmp_path / "arm.urdf", upright_arm(BAR.format(inertial))), "tool")
+    data, checker = robot.model.createData(), make_checker("coal", robot)
+    backend, collisions = DartBackend(robot, 1), 0
+    for target in np.random.default_rng(0).uniform(-1.5, 1.5, (30, 3)):
+        backend.reset(np.zeros((1, 3)))
+        for _ in range(15):
+            state = backend.step(target[None])
+            if state.collided[0]:
+                collisions += 1
+                assert CoalChecker(robot, np.full(3, 0.1)).check(state.q)[0]
+                break
+            assert not checker.check(state.q)[0]
+            pin.forwardKinematics(robot.model, data, state.q[0])
+            for body, placement in zip(backend.arms[0].bodies, data.oMi, strict=True):
+                transform = body.getWorldTransform().matrix()
+                np.testing.assert_allclose(transform, placement.homogeneous, rtol=0.0, atol=1e-9)
+    assert 5 < collisions < 25
+
+
+def test_an_arm_with_a_joint_that_follows_is_restored_to_the_bit(tmp_path: Path) -> None:
+    text = upright_arm(BAR.format(BAR_INERTIAL))
+    robot = RobotModel.load(write(tmp_path / "arm.urdf", text), "tool")
+    backend, target = DartBackend(robot, 2), np.array([[0.5, 0.9, -0.4], [1.0, -0.5, 0.3]])
+    backend.step(target)
+    snapshot = pickled(backend.save())
+    expected = [backend.step(target) for _ in range(20)]
+    other = DartBackend(robot, 2)
+    other.restore(snapshot)
+    for state in expected:
+        assert_same_state(other.step(target), state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,15 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, assert_same_state, uniform_q
 from gym_mara.types import Floats, Mask
-from tests.helpers import PATH_ENDS, robot_model
+from tests.helpers import PATH_ENDS, joint_xml, robot_model, urdf_xml, write
 
 VELOCITY, PERIOD = 0.5, 0.02
 TRAVEL = VELOCITY * PERIOD
 
 
 def _backend(num_envs: int = 1, **settings: Any) -> PinocchioBackend:
-    return PinocchioBackend(robot_model("mara"), num_envs, **settings)
+    """A backend of a MARA whose joints may be as fast as a test wants."""
+    return PinocchioBackend(robot_model("mara", velocity_limit=10.0), num_envs, **settings)
 
 
 def _travelled(start: Floats, target: Floats, travel: float) -> Floats:
@@ -71,6 +73,32 @@ def test_joints_move_at_the_given_velocity_and_arrive_exactly() -> None:
         assert not state.qd[arrived].any()
     np.testing.assert_array_equal(state.q, target)
     assert not state.ee_velocity.any()
+
+
+def test_no_joint_is_faster_than_its_own_limit() -> None:
+    limits = (0.5, 1.57, 0.3, 1.0, 0.1, 1.57)
+    robot = RobotModel.load("mara", velocity_limit=limits)
+    backend = PinocchioBackend(robot, 1, max_joint_velocity=1.0)
+    fastest = np.minimum(1.0, limits)
+    np.testing.assert_array_equal(backend.joint_velocity, fastest)
+    backend.reset(np.zeros((1, 6)))
+    direction = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    for number in range(1, 4):
+        state = backend.step(0.3 * direction[None])
+        np.testing.assert_allclose(state.q[0], number * PERIOD * fastest * direction, atol=1e-12)
+        np.testing.assert_array_equal(state.qd[0], fastest * direction)
+
+
+def test_a_joint_without_velocity_can_teleport_and_not_travel(tmp_path: Path) -> None:
+    still = joint_xml(1, limit='<limit lower="-2" upper="1.5" effort="10" velocity="0"/>')
+    path = write(tmp_path / "arm.urdf", urdf_xml(joint_xml(0), still))
+    robot = RobotModel.load(path, "link2")
+    assert PinocchioBackend(robot, 1).step(np.ones((1, 2))).q.tolist() == [[1.0, 1.0]]
+    with pytest.raises(GymMaraError, match=r"joint joint1 of stick .*limit is 0.*velocity_limit"):
+        PinocchioBackend(robot, 1, max_joint_velocity=1.0)
+    mended = RobotModel.load(path, "link2", velocity_limit={"joint1": 0.5})
+    backend = PinocchioBackend(mended, 1, max_joint_velocity=1.0)
+    np.testing.assert_array_equal(backend.joint_velocity, [1.0, 0.5])
 
 
 def test_the_velocity_of_the_tool_is_the_derivative_of_its_position() -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from gym_mara.collision import make_checker
@@ -18,6 +19,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, COPIES, uniform_q
 from tests.helpers import PATH_ENDS, TARGET_Q, Floats, robot_model
+from tests.shape_pairs import clearance, held
 
 ENGINES = ("coal", "coal in threads", "fcl")
 CONTACT = 1e-4
@@ -31,19 +33,12 @@ def _checker(engine: str, robot: str) -> CollisionChecker:
     return make_checker(name, robot_model(robot), 2 if threads else 1)
 
 
-def _clearance(robot: RobotModel, q: Floats) -> float:
-    """The smallest distance of any pair, m, by Coal; negative where they overlap."""
-    data = robot.geometry.createData()
-    pin.computeDistances(robot.model, robot.model.createData(), robot.geometry, data, q)
-    return min(float(result.min_distance) for result in data.distanceResults)
-
-
 def _assert_agree(name: str, q: Floats) -> None:
     coal, threads, fcl = (_checker(engine, name).check(q) for engine in ENGINES)
     assert threads.tolist() == coal.tolist()
     assert coal.any()
     assert not coal.all()
-    apart = {int(row): _clearance(robot_model(name), q[row]) for row in np.flatnonzero(coal != fcl)}
+    apart = {int(row): clearance(robot_model(name), q[row]) for row in np.flatnonzero(coal != fcl)}
     assert {row: d for row, d in apart.items() if abs(d) > CONTACT} == {}
 
 
@@ -80,10 +75,10 @@ def test_clearance_decides(engine: str) -> None:
     """Beyond 0.1 mm of contact a flag is the sign of Coal's signed distance."""
     mara = robot_model("mara")
     q = uniform_q(mara, 300, 2)
-    clearance = np.array([_clearance(mara, row) for row in q])
-    clear = np.abs(clearance) > CONTACT
+    distance = np.array([clearance(mara, row) for row in q])
+    clear = np.abs(distance) > CONTACT
     flags = _checker(engine, "mara").check(q)
-    np.testing.assert_array_equal(flags[clear], clearance[clear] < 0.0)
+    np.testing.assert_array_equal(flags[clear], distance[clear] < 0.0)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -183,3 +178,18 @@ def test_an_engine_refuses_threads_that_it_does_not_support(
         GymMaraError, match=f"(at least 1|1 unless collision='coal').* not {threads}"
     ):
         make_checker(engine, mara, threads)
+
+
+def test_with_a_margin_no_collision_of_meshes_nearby_is_missed(tmp_path: Path) -> None:
+    """The margin is checked on the meshes' hulls, which is quick, and reports a little more."""
+    trimesh.creation.torus(0.2, 0.05).export(tmp_path / "torus.stl")
+    torus = f'<mesh filename="{tmp_path}/torus.stl"/>'
+    robot = held(tmp_path, torus, torus)
+    coal, step = make_checker("coal", robot), np.full(6, 0.02)
+    near = coal.with_margin(step)
+    assert near is not None
+    q = uniform_q(robot, 200, 0)
+    moved = q + np.random.default_rng(0).uniform(-step, step, q.shape)
+    free = ~near.check(q)
+    assert free.any()
+    assert not (free & coal.check(moved)).any()

@@ -92,10 +92,14 @@ def test_an_episode_in_the_default_wrappers_gives_no_warning(name: str) -> None:
 # Spaces.
 
 
-@pytest.mark.parametrize("robot", ["mara", "ur5", "panda", "so100"])
-def test_the_action_space_is_that_of_the_paper(robot: str) -> None:
-    space = MaraEnv(robot=robot_model(robot)).action_space
-    assert space == gymnasium.spaces.Box(-np.pi, np.pi, space.shape, np.float32)
+@pytest.mark.parametrize(
+    ("robot", "turns"), [("mara", [1, 1, 1, 1, 1, 1]), ("ur5", [2, 2, 1, 2, 2, 2])]
+)
+def test_the_action_space_is_that_of_the_paper_or_longer_ranges(
+    robot: str, turns: list[int]
+) -> None:
+    ends = (np.pi * np.array(turns)).astype(np.float32)
+    assert MaraEnv(robot=robot_model(robot)).action_space == gymnasium.spaces.Box(-ends, ends)
 
 
 def test_the_action_space_spans_the_whole_travel_of_a_prismatic_joint(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, COPIES, pickled
-from tests.helpers import ENV_IDS, TASK_NAMES, Floats
+from tests.helpers import ENV_IDS, TASK_NAMES, Floats, robot_model
 
 MODES = ("NextStep", "SameStep")
 ON_COLLISION = ("reset", "terminate", "continue")
@@ -109,13 +109,13 @@ def _assert_same_results(native: VecEnv, singles: VecEnv, steps: int, limit: flo
 @pytest.mark.parametrize("on_collision", ON_COLLISION)
 @pytest.mark.parametrize("velocity", [None, 5.0], ids=["teleport", "travel"])
 def test_it_gives_the_results_of_single_envs(
-    mara: RobotModel, count: int, mode: str, on_collision: str, velocity: float | None
+    count: int, mode: str, on_collision: str, velocity: float | None
 ) -> None:
     native, singles = _pair(
         "gym_mara/MARACollisionOrient-v0",
         count,
         mode,
-        robot=mara,
+        robot=robot_model("mara", velocity_limit=5.0),
         on_collision=on_collision,
         max_joint_velocity=velocity,
         control_period=0.1,

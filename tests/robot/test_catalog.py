@@ -28,6 +28,7 @@ def test_every_robot_loads_and_starts_free_and_within_its_limits(name: str) -> N
     assert (robot.velocity_limit > 0.0).all()
     assert robot.collision_pairs
     assert not make_checker("coal", robot).check(robot.home[None]).any()
+    assert {finding.severity for finding in robot.findings} <= {"note"}  # not the user's own files
 
 
 def test_an_unknown_name_gets_the_nearest_and_all_valid_ones() -> None:

@@ -63,7 +63,7 @@ def test_another_end_effector_is_another_arm(tmp_path: Path) -> None:
 def test_the_vertices_of_a_mesh_count_and_the_path_does_not(tmp_path: Path) -> None:
     def with_mesh(folder: str, height: float) -> str:
         (tmp_path / folder).mkdir()
-        points = ("0 0 0", "1 0 0", "0 1 0", f"0 0 {height}")
+        points = ("0 0 0", "0.05 0 0", "0 0.05 0", f"0 0 {height}")
         faces = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
         lines = [f"v {point}" for point in points]
         lines += ["f " + " ".join(str(i + 1) for i in face) for face in faces]
@@ -71,5 +71,5 @@ def test_the_vertices_of_a_mesh_count_and_the_path_does_not(tmp_path: Path) -> N
         text = ARM.replace('<sphere radius="0.05"/>', '<mesh filename="part.obj"/>')
         return of(tmp_path / folder, text)
 
-    assert with_mesh("a", 1.0) == with_mesh("b", 1.0)
-    assert with_mesh("c", 1.1) != with_mesh("d", 1.0)
+    assert with_mesh("a", 0.05) == with_mesh("b", 0.05)
+    assert with_mesh("c", 0.06) != with_mesh("d", 0.05)

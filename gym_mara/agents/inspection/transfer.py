@@ -15,6 +15,7 @@ from gym_mara.backends import backend_settings, installed_backends
 from gym_mara.envs import task_keywords
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown, whole_number
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats
 
 SETTLED = 0.005
@@ -69,7 +70,7 @@ def transfer(
         warnings.warn(reason, stacklevel=2)
     settings = {name: backend_settings(name) for name in installed}
     sensors = {field.name for field in fields(SensorSettings)}
-    everywhere = {"robot", "ee_frame", *task_keywords(run.config.env), *sensors}
+    everywhere = {*ROBOT_KEYWORDS, *task_keywords(run.config.env), *sensors}
     for name in given:
         valid = everywhere.union(*settings.values())
         if name not in valid:

@@ -6,14 +6,14 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 from gym_mara.agents.algorithms.base import Preset, plain_values
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import DamagedFileError, parsed_json, read_json
 from gym_mara.rendering import RenderSettings
-from gym_mara.robot.model import is_path
+from gym_mara.robot.options import with_paths
 
 MOST_STEPS = 10**12
 
@@ -37,7 +37,7 @@ class DamagedRunError(DamagedFileError):
 class RunConfig:
     """What a run trains. The same configuration with the same versions of the libraries gives the same run.
 
-    The relative path of a robot is made absolute.
+    Relative paths of a robot and of its packages are made absolute.
 
     Raises:
         GymMaraError: a value is out of its range, or is no option of a run.
@@ -70,9 +70,7 @@ class RunConfig:
                 f"seed must be a whole number from 0 to 2**32 - 1, not {short(self.seed)}"
             )
         check_options(self.env_options, pictures=False)
-        options = dict(self.env_options)
-        if is_path(robot := options.get("robot")):
-            options["robot"] = str(Path(robot).absolute())
+        options = with_paths(self.env_options, lambda path: str(Path(path).absolute()))
         plain_values("env_options", options)
         object.__setattr__(self, "env_options", options)
 
@@ -92,10 +90,12 @@ class _ConfigFile(RunConfig):
     versions: dict[str, str] = field(kw_only=True)
 
     def __post_init__(self) -> None:
-        robot = self.env_options.get("robot")
-        if is_path(robot) and not Path(robot).is_absolute():
-            raise GymMaraError(f"the path of the robot must be absolute, not {robot!r}")
+        with_paths(self.env_options, _refuse_path)
         super().__post_init__()
+
+
+def _refuse_path(path: str) -> NoReturn:
+    raise GymMaraError(f"the paths of the robot must be absolute, not {path!r}")
 
 
 def read_config(file: Path) -> RunConfig:

@@ -72,8 +72,8 @@ class PolicyDescription:
     def __post_init__(self) -> None:
         if not len(self.joints) == len(self.low) == len(self.high):
             raise GymMaraError("'joints', 'low' and 'high' must have the same length")
-        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise GymMaraError("'low' must be below 'high'")
+        if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):
+            raise GymMaraError("'low' must not be above 'high'")
         if self.groups is not None and (
             self.normalisation or sum(self.groups.values()) != self.size
         ):

@@ -18,11 +18,14 @@ from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats
 
 METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
 
 MOST_EPISODES = 100_000
+_OTHER_ROBOT = {*ROBOT_KEYWORDS} - {"package_dirs"}
+"""The keyword arguments that make another robot; `package_dirs` only says where its files are."""
 RANDOM_EPISODES = 5
 """How many episodes judge a policy where they are random: as many as in Stable-Baselines3's `EvalCallback`."""
 
@@ -105,7 +108,7 @@ def options_on(
     Args:
         backend: the name of the backend.
         config: the configuration of the run.
-        options: keyword arguments that replace those of the run. Another `robot` or `ee_frame` is loaded here; with it the
+        options: keyword arguments that replace those of the run. With one that changes the robot, it is loaded here, and the
             policy may play on a robot that differs from that of the training.
 
     Raises:
@@ -118,10 +121,12 @@ def options_on(
 def with_options(own: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """The keyword arguments of a run's environment, some of them replaced as in `options_on`."""
     check_options(given, pictures=True)
+    if isinstance(given.get("robot"), RobotModel):  # nothing of the run's robot is left
+        own = {name: value for name, value in own.items() if name not in ROBOT_KEYWORDS}
     merged = {**own, **given}
-    if "robot" in given or "ee_frame" in given:
-        frame = merged.pop("ee_frame", None)
-        merged["robot"] = RobotModel.load(merged.get("robot", "mara"), frame)
+    if given.keys() & _OTHER_ROBOT:
+        of_robot = {name: merged.pop(name) for name in ROBOT_KEYWORDS if name in merged}
+        merged["robot"] = RobotModel.load(of_robot.pop("robot", "mara"), **of_robot)
     return merged
 
 

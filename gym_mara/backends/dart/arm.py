@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pinocchio as pin
 
+from gym_mara.backends.dart.shapes import Detector
 from gym_mara.backends.servo import has_diverged
 from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
-from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
-from gym_mara.robot.kinematics import motion_axis
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Sphere, shape_of
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
@@ -24,16 +21,12 @@ with needs("the backend 'dart'", "dart"):
 
 GRAVITY = 9.81
 """m/s², downwards."""
-DETECTORS = {
-    "fcl": "FCLCollisionDetector",
-    "dart": "DARTCollisionDetector",
-    "bullet": "BulletCollisionDetector",
-    "ode": "OdeCollisionDetector",
-}
 LOOK_AHEAD = 0.01
 """The duration of a block of physics steps for which contacts are ruled out at once, s."""
 # DART needs a mass for every body, even for a link welded to a body that already has the mass of both; kg and kg·m².
-_NO_MASS = 1e-9
+_NO_INERTIA = pin.Inertia(1e-9, np.zeros(3), 1e-9 * np.eye(3))
+_REACHED = 1e-6
+"""A joint this close to its commanded velocity, rad/s (m/s), has reached it; DART is accurate to 1e-8."""
 
 
 class DartArm:
@@ -42,10 +35,10 @@ class DartArm:
     Args:
         robot: the arm.
         physics_step: s.
-        detector: the collision detector, one of DETECTORS; None for a world without collisions.
+        detector: the collision detector, one of `DETECTORS`; None for a world without collisions.
         velocity_limit: of the joints (J,), rad/s; None for the robot's.
         like: an arm of the same robot and settings, with which it shares what has no state.
-        servo: whether motors move the joints; without them the arm falls.
+        servo: whether motors move the joints, up to end stops at their limits; without both the arm falls freely.
 
     Raises:
         GymMaraError: the detector is unknown, or DART does not know a shape of the robot.
@@ -65,28 +58,39 @@ class DartArm:
         self.physics_step = physics_step
         self.skeleton = dart.dynamics.Skeleton(robot.name)
         self.bodies = self._build_bodies()
-        self._joints = [body.getParentJoint() for body in self.bodies[1:]]
+        joints = [body.getParentJoint() for body in self.bodies[1:]]
+        self._joints, followers = joints[: robot.num_joints], joints[robot.num_joints :]
         speed = robot.velocity_limit if velocity_limit is None else velocity_limit
         if servo:
-            for joint in self._joints:
+            for joint, low, high in zip(self._joints, robot.lower, robot.upper, strict=True):
                 joint.setActuatorType(dart.dynamics.SERVO)
+                joint.setPositionLowerLimit(0, low)
+                joint.setPositionUpperLimit(0, high)
+                joint.setLimitEnforcement(True)
             self.set_parameters()
+        # They are driven along: contacts do not hold them back, nor act on the joints that they mimic.
+        for joint in followers:
+            joint.setActuatorType(dart.dynamics.VELOCITY)
+        self._command = self._command_all if followers else self.skeleton.setCommands
+        self._detector: Detector | None = None
         if detector is not None:
-            self._build_shapes()
-        self.world = _world(physics_step, detector or "fcl")
+            self._detector = like._detector if like else Detector(detector, robot)
+        self._build_shapes()
+        self.world = self._new_world()
         self.world.addSkeleton(self.skeleton)
         self._forbid_contacts()
         # The same arm in a world without collision detection, which is most of what a step costs.
-        self._free_world = _world(physics_step, detector or "fcl")
+        self._free_world = self._new_world()
         self._free_world.addSkeleton(self.skeleton)
         for world in (self.world, self._free_world):
             world.getConstraintSolver().getCollisionGroup().setAutomaticUpdate(False)
         self._free_world.getConstraintSolver().getCollisionGroup().removeAllShapeFrames()
         self._block = max(1, round(LOOK_AHEAD / physics_step))
+        self._commanded = np.zeros(robot.num_joints)
         self._speed, self._fastest = speed, 1.05 * speed
         within_block = 1.25 * speed * self._block * physics_step
         self._clearance: CollisionChecker = NoChecker(robot)
-        if detector is not None:
+        if self._detector is not None:
             self._clearance = like._clearance if like else CoalChecker(robot, within_block)
 
     def _build_bodies(self) -> list[Any]:
@@ -95,7 +99,7 @@ class DartArm:
         bodies = [self.skeleton.createWeldJointAndBodyNodePair()[1]]
         _set_inertia(bodies[0], pin.Inertia(1.0, np.zeros(3), np.eye(3)))
         for number in range(1, model.njoints):
-            linear, angular = np.split(motion_axis(model.joints[number]), 2)
+            linear, angular = np.split(self.robot.motion(number), 2)
             parent = bodies[model.parents[number]]
             if angular.any():
                 properties = dart.dynamics.RevoluteJointProperties()
@@ -107,13 +111,19 @@ class DartArm:
             properties.mAxis = angular if angular.any() else linear
             properties.mT_ParentBodyToJoint = _isometry(model.jointPlacements[number])
             joint, body = create(properties)
-            joint.setDampingCoefficient(0, model.damping[number - 1])
-            _set_inertia(body, model.inertias[number])
+            inertia = model.inertias[number]
+            if number <= self.robot.num_joints:
+                joint.setDampingCoefficient(0, model.damping[number - 1])
+            elif inertia.mass <= 0.0:
+                inertia = _NO_INERTIA
+            _set_inertia(body, inertia)
             bodies.append(body)
         return bodies
 
     def _build_shapes(self) -> None:
         """The shapes of each link, on a body with the name of the link."""
+        if self._detector is None:
+            return
         links: dict[str, Any] = {}
         unnamed = dict(enumerate(self.bodies))
         for index, geometry_object in enumerate(self.robot.geometry.geometryObjects):
@@ -123,13 +133,14 @@ class DartArm:
                 body = unnamed.pop(number, None)
                 if body is None:
                     body = self.bodies[number].createWeldJointAndBodyNodePair()[1]
-                    _set_inertia(body, pin.Inertia(_NO_MASS, np.zeros(3), _NO_MASS * np.eye(3)))
+                    _set_inertia(body, _NO_INERTIA)
                 body.setName(link)
                 links[link] = body
-            node = links[link].createShapeNode(_shape(self.robot, index))
-            node.createCollisionAspect()
-            node.createDynamicsAspect()
-            node.setRelativeTransform(_isometry(geometry_object.placement))
+            for shape, placement in self._detector.shapes[index]:
+                node = links[link].createShapeNode(shape)
+                node.createCollisionAspect()
+                node.createDynamicsAspect()
+                node.setRelativeTransform(_isometry(geometry_object.placement * placement))
         self.skeleton.enableSelfCollisionCheck()
         self.skeleton.enableAdjacentBodyCheck()
 
@@ -142,6 +153,19 @@ class DartArm:
                 pair = frozenset((one.getName(), other.getName()))
                 if pair not in self.robot.collision_pairs:
                     self._option.collisionFilter.addBodyNodePairToBlackList(one, other)
+
+    def _new_world(self) -> Any:
+        """An empty world with gravity."""
+        world = dart.simulation.World()
+        world.setTimeStep(self.physics_step)
+        world.setGravity([0.0, 0.0, -GRAVITY])
+        if self._detector is not None:
+            world.setCollisionDetector(self._detector.engine)
+        # DART must not deactivate an arm at rest: it would no longer follow small commands.
+        deactivation = world.getDeactivationOptions()
+        deactivation.mEnabled = False
+        world.setDeactivationOptions(deactivation)
+        return world
 
     def set_parameters(
         self,
@@ -160,9 +184,11 @@ class DartArm:
         """
         model, count = self.robot.model, self.robot.num_joints
         friction = model.friction if joint_friction is None else joint_friction
-        effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
+        self._effort = effort = np.broadcast_to(effort_limit * self.robot.effort_limit, count)
         mass, friction = np.broadcast_to(mass, count), np.broadcast_to(friction, count)
-        for index, (joint, body) in enumerate(zip(self._joints, self.bodies[1:], strict=True)):
+        for index, (joint, body) in enumerate(
+            zip(self._joints, self.bodies[1 : 1 + count], strict=True)
+        ):
             joint.setForceLowerLimit(0, -effort[index])
             joint.setForceUpperLimit(0, effort[index])
             joint.setCoulombFriction(0, friction[index])
@@ -179,8 +205,9 @@ class DartArm:
 
     def set_state(self, q: Floats, qd: Floats) -> None:
         """Put the arm at q, rad, with velocities qd, rad/s; both (J,)."""
-        self.skeleton.setPositions(q)
-        self.skeleton.setVelocities(qd)
+        followers = self.robot.followers
+        self.skeleton.setPositions(np.append(q, [each.position(q) for each in followers]))
+        self.skeleton.setVelocities(np.append(qd, [each.velocity(qd) for each in followers]))
         self.skeleton.resetAccelerations()
         self.skeleton.resetCommands()
         self.skeleton.clearConstraintImpulses()
@@ -188,17 +215,32 @@ class DartArm:
     @property
     def q(self) -> Floats:
         """Joint positions (J,), rad."""
-        return np.asarray(self.skeleton.getPositions())
+        return np.asarray(self.skeleton.getPositions())[: self.robot.num_joints]
 
     @property
     def qd(self) -> Floats:
         """Joint velocities (J,), rad/s."""
-        return np.asarray(self.skeleton.getVelocities())
+        return np.asarray(self.skeleton.getVelocities())[: self.robot.num_joints]
+
+    @property
+    def followers(self) -> Floats:
+        """Positions and velocities of the joints that follow others (2, F), rad and rad/s; they lag in a jam."""
+        state = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        return np.array(state)[:, self.robot.num_joints :]
+
+    @followers.setter
+    def followers(self, state: Floats) -> None:
+        for index, (q, qd) in enumerate(state.T.tolist(), self.robot.num_joints):
+            self.skeleton.setPosition(index, q)
+            self.skeleton.setVelocity(index, qd)
 
     @property
     def torque(self) -> Floats:
         """What the motors exerted in the last physics step (J,), Nm."""
-        return np.asarray(self.skeleton.getConstraintForces())
+        # DART adds what end stops and contacts exert. A motor that does not reach its commanded velocity exerts all it can.
+        effort, missing = self._effort, self._commanded - self.qd
+        forces = np.clip(self.skeleton.getConstraintForces()[: len(effort)], -effort, effort)
+        return np.where(np.abs(missing) > _REACHED, np.copysign(effort, missing), forces)
 
     def run(self, velocities: Floats) -> tuple[Contact, ...]:
         """One physics step for each row of commanded joint velocities (K, J), rad/s; the contacts in any of them.
@@ -208,6 +250,7 @@ class DartArm:
         motor is too weak to hold the arm.
         """
         deepest: dict[tuple[str, str], float] = {}
+        self._commanded = velocities[-1]
         for start in range(0, len(velocities), self._block):
             block = velocities[start : start + self._block]
             if self.may_touch():
@@ -215,11 +258,21 @@ class DartArm:
                     break
                 self._run_with_contacts(block, deepest)
             else:
-                command, step = self.skeleton.setCommands, self._free_world.step
+                command, step = self._command, self._free_world.step
                 for velocity in block:
                     command(velocity)
                     step()
         return tuple(Contact(links, depth) for links, depth in sorted(deepest.items()))
+
+    def _command_all(self, velocities: Floats) -> None:
+        """Command the velocities of the motors (J,), rad/s, for one physics step, and those of the joints that follow."""
+        count, step = self.robot.num_joints, self.physics_step
+        q = self.skeleton.getPositions()
+        after = q[:count] + step * velocities
+        wanted = [each.position(after) for each in self.robot.followers]
+        speed = [abs(each.velocity(self._fastest)) for each in self.robot.followers]
+        follow = np.clip((wanted - q[count:]) / step, np.negative(speed), speed)
+        self.skeleton.setCommands(np.append(velocities, follow))
 
     def contacts(self) -> tuple[Contact, ...]:
         """The contacts at the current state."""
@@ -229,7 +282,7 @@ class DartArm:
 
     def may_touch(self) -> bool:
         """Whether any links could touch within the next block of steps."""
-        q, qd = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        q, qd = self.q, self.qd
         slow = np.count_nonzero(np.abs(qd) <= self._fastest) == len(qd)  # not if it is NaN
         return bool(not slow or self._clearance.check(q[None])[0])
 
@@ -239,7 +292,7 @@ class DartArm:
         group = self.world.getConstraintSolver().getCollisionGroup()
         group.removeAllShapeFrames()
         group.addShapeFramesOf(self.skeleton)
-        command, step = self.skeleton.setCommands, self.world.step
+        command, step = self._command, self.world.step
         result = self.world.getLastCollisionResult
         for velocity in velocities:
             command(velocity)
@@ -250,20 +303,6 @@ class DartArm:
         # A step detects contacts before it moves, so those at the end of the last step are still unknown.
         if self.world.checkCollision(self._option, found := dart.collision.CollisionResult()):
             _note_contacts(found, deepest)
-
-
-def _world(physics_step: float, detector: str) -> Any:
-    """An empty world with gravity."""
-    one_of("detector", detector, DETECTORS)
-    world = dart.simulation.World()
-    world.setTimeStep(physics_step)
-    world.setGravity([0.0, 0.0, -GRAVITY])
-    world.setCollisionDetector(getattr(dart.collision, DETECTORS[detector])())
-    # DART must not deactivate an arm at rest: it would no longer follow small commands.
-    deactivation = world.getDeactivationOptions()
-    deactivation.mEnabled = False
-    world.setDeactivationOptions(deactivation)
-    return world
 
 
 def _note_contacts(result: Any, deepest: dict[tuple[str, str], float]) -> None:
@@ -281,34 +320,3 @@ def _isometry(placement: pin.SE3) -> Any:
 
 def _set_inertia(body: Any, inertia: pin.Inertia) -> None:
     body.setInertia(dart.dynamics.Inertia(inertia.mass, inertia.lever, inertia.inertia))
-
-
-def _shape(robot: RobotModel, index: int) -> Any:
-    """DART's shape of one of the robot's collision shapes."""
-    match shape_of(robot.model, robot.geometry.geometryObjects[index]):
-        case Box(size):
-            return dart.dynamics.BoxShape(size)
-        case Sphere(radius):
-            return dart.dynamics.SphereShape(radius)
-        case Cylinder(radius, length):
-            return dart.dynamics.CylinderShape(radius, length)
-        case Capsule(radius, length):
-            return dart.dynamics.CapsuleShape(radius, length)
-        case Mesh(path, scale, convex=False):
-            return _mesh(path, scale)
-    raise GymMaraError(
-        f"the backend 'dart' does not support the convex hull of link {robot.link_of(index)!r}"
-    )
-
-
-def _mesh(path: str, scale: Floats) -> Any:
-    """A mesh from a file; DART reads meshes only as parts of a URDF."""
-    sizes = " ".join(repr(float(value)) for value in scale)
-    urdf = (
-        f'<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename={quoteattr(path)} '
-        f'scale="{sizes}"/></geometry></collision></link></robot>'
-    )
-    skeleton = dart.utils.DartLoader().parseSkeletonString(urdf, "")
-    if skeleton is None:
-        raise GymMaraError(f"DART cannot read the mesh {path!r}")
-    return skeleton.getBodyNode(0).getShapeNode(0).getShape()

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.backends.dart.arm import DETECTORS, DartArm
+from gym_mara.backends.dart.arm import DartArm
+from gym_mara.backends.dart.shapes import DETECTORS
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import Motion, ServoBackend, servo_motion
 from gym_mara.errors import GymMaraError, one_of
@@ -153,12 +154,22 @@ class DartBackend(ServoBackend):
         self.arms[arm].set_state(q, qd)
 
     def save(self) -> dict[str, Any]:
-        return super().save() | {"targets": self._targets.copy()}
+        return super().save() | {"targets": self._targets.copy()} | self._followers()
+
+    def _followers(self) -> dict[str, Floats]:
+        """The state of the joints that follow others (N, 2, F), if the robot has any."""
+        if not self.robot.followers:
+            return {}
+        return {"followers": np.array([arm.followers for arm in self.arms])}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         check_fits("targets", snapshot.get("targets"), self._targets)
+        for name, own in self._followers().items():
+            check_fits(name, snapshot.get(name), own)
         super().restore(snapshot)
         self._targets = copy.copy(snapshot["targets"])
         for index, arm in enumerate(self.arms):
             self._apply_parameters(index)
             arm.set_state(self._q[index], self._qd[index])
+            if self.robot.followers:
+                arm.followers = snapshot["followers"][index]

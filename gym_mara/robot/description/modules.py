@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gym_mara.errors import GymMaraError, unknown
-from gym_mara.robot.srdf import read_xml
+from gym_mara.robot.description.xml_files import read_xml
 from gym_mara.types import Floats
 
 FEWEST_JOINTS, MOST_JOINTS = 3, 7

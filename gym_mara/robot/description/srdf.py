@@ -1,7 +1,9 @@
 """SRDF, ROS's format for what a URDF does not hold: disabled collisions, named poses, the end effector.
 
-Pinocchio reads which pairs of links are disabled; the rest is read here:
+Pinocchio reads a part of it. All is read here:
 
+- Disabled pairs of links. Pinocchio ignores `disable_default_collisions`, MoveIt's short form for a link that collides with none
+  but those that `enable_collisions` names.
 - Named poses. Pinocchio's `loadReferenceConfigurations` sorts the poses by name, sets the joints that a pose does not name
   to zero, and takes a value that it cannot read for zero. Then it is lost which pose comes first, and which names every
   joint of the arm.
@@ -18,13 +20,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
-from gym_mara.files import LARGEST_TEXT, read_bytes
-
-_DEEPEST = 100
-"""Of the elements of a URDF or SRDF: the parsers that read it later are recursive."""
+from gym_mara.robot.description.xml_files import read_xml
 
 
 class Pose(NamedTuple):
@@ -40,10 +38,12 @@ class Pose(NamedTuple):
 class Semantics:
     """What gym_mara reads of an SRDF file."""
 
-    xml: str = "<robot/>"
-    """The SRDF itself."""
+    disabled: frozenset[frozenset[str]] = frozenset()
+    """The pairs of links that are never checked for collision."""
+    enabled: frozenset[frozenset[str]] = frozenset()
+    """The pairs that are checked although a link of theirs is in `disabled_links`."""
     disabled_links: frozenset[str] = frozenset()
-    """The links of the pairs that are never checked for collision."""
+    """The links of which no other pair is checked."""
     poses: tuple[Pose, ...] = ()
     """In the file's order."""
     end_effector: str | None = None
@@ -55,27 +55,40 @@ class Semantics:
         Raises:
             GymMaraError: the pose gives one of the joints several values, or none.
         """
-        for pose, values in self.poses:
-            if all(joint in values for joint in joints):
-                for joint in joints:
-                    if len(values[joint]) != 1:
-                        raise GymMaraError(
-                            f"the SRDF's pose {pose!r} gives joint {joint!r} {len(values[joint])} values; "
-                            "a revolute or prismatic joint has one"
-                        )
-                return [values[joint][0] for joint in joints]
-        return [0.0] * len(joints)
+        pose, values = self.home_pose(joints)
+        for joint in joints:
+            if len(values.get(joint, (0.0,))) != 1:
+                raise GymMaraError(
+                    f"the SRDF's pose {pose!r} gives joint {joint!r} {len(values[joint])} values; "
+                    "a revolute or prismatic joint has one"
+                )
+        return [values.get(joint, (0.0,))[0] for joint in joints]
+
+    def home_pose(self, joints: Sequence[str]) -> Pose:
+        """The first pose that names every one of these joints; without values if there is none."""
+        fitting = (pose for pose in self.poses if all(joint in pose.values for joint in joints))
+        return next(fitting, Pose("", {}))
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The links of pairs and the joints of poses that are named here."""
+        joints = (pose.values for pose in self.poses)
+        return self.disabled_links.union(*self.disabled, *self.enabled, *joints)
 
     def unknown_names(self, root: ElementTree.Element) -> list[str]:
-        """The links and joints that are named here and that a URDF lacks, in alphabetical order."""
-        links = {link.get("name") for link in root.iter("link")}
-        joints = {joint.get("name") for joint in root.iter("joint")}
-        named = {joint for pose in self.poses for joint in pose.values}
-        return sorted((self.disabled_links - links) | (named - joints))
+        """The names here that neither a link nor a joint of a URDF has, in alphabetical order."""
+        return sorted(self.names - {e.get("name") for e in root if e.tag in ("link", "joint")})
 
-    def remove_disabled_pairs(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
-        """Remove the disabled pairs of links from a geometry's collision pairs."""
-        pin.removeCollisionPairsFromXML(model, geometry, self.xml)
+    def disables(self, pair: frozenset[str]) -> bool:
+        """Whether a pair of links is never checked for collision."""
+        return pair in self.disabled or (
+            pair not in self.enabled and bool(pair & self.disabled_links)
+        )
+
+    def disables_any(self, root: ElementTree.Element) -> bool:
+        """Whether pairs of links of a URDF are disabled."""
+        links = {link.get("name", "") for link in root.findall("link")}
+        return bool(self.disabled_links & links) or any(pair <= links for pair in self.disabled)
 
 
 def read_srdf(path: Path) -> Semantics:
@@ -93,15 +106,21 @@ def read_srdf(path: Path) -> Semantics:
         for state in root.iter("group_state")
     )
     effector = next(root.iter("end_effector"), None)
+    defaults = root.iter("disable_default_collisions")
     return Semantics(
-        ElementTree.tostring(root, encoding="unicode"),
-        frozenset(
-            _attribute(path, pair, end)
-            for pair in root.iter("disable_collisions")
-            for end in ("link1", "link2")
-        ),
-        poses,
-        None if effector is None else _attribute(path, effector, "parent_link"),
+        disabled=_pairs(path, root, "disable_collisions"),
+        enabled=_pairs(path, root, "enable_collisions"),
+        disabled_links=frozenset(_attribute(path, element, "link") for element in defaults),
+        poses=poses,
+        end_effector=None if effector is None else _attribute(path, effector, "parent_link"),
+    )
+
+
+def _pairs(path: Path, root: ElementTree.Element, tag: str) -> frozenset[frozenset[str]]:
+    """The pairs of links in the elements of this name."""
+    return frozenset(
+        frozenset(_attribute(path, element, end) for end in ("link1", "link2"))
+        for element in root.iter(tag)
     )
 
 
@@ -127,31 +146,3 @@ def _position(path: Path, joint: ElementTree.Element) -> tuple[float, ...]:
             "a joint's value must be a finite number, rad (m for a prismatic joint)"
         )
     return position
-
-
-def read_xml(path: Path, kind: str) -> ElementTree.Element:
-    """The root of an XML file whose root element is `<robot>`.
-
-    Raises:
-        GymMaraError: the file is missing, is not XML, or describes no robot.
-    """
-    content = read_bytes(path, LARGEST_TEXT)
-    try:
-        root = ElementTree.fromstring(content)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: its encoding
-        raise GymMaraError(f"the {kind} {str(path)!r} is broken XML: {error}") from error
-    if _depth(root) > _DEEPEST:
-        raise GymMaraError(
-            f"the {kind} {str(path)!r} has elements nested more than {_DEEPEST} deep; a robot has fewer than 10"
-        )
-    if root.tag != "robot":
-        raise GymMaraError(f"{str(path)!r} is not a {kind}: its root is <{root.tag}>, not <robot>")
-    return root
-
-
-def _depth(root: ElementTree.Element) -> int:
-    """How deep the elements are nested; at most one more than allowed."""
-    level, depth = [root], 0
-    while level and depth <= _DEEPEST:
-        level, depth = [child for element in level for child in element], depth + 1
-    return depth

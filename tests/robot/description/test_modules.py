@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.modules import MARA, MODULES
+from gym_mara.robot.description.modules import MARA, MODULES
 from gym_mara.testing import pickled, uniform_q
 from tests.helpers import MODULAR_ARMS
 

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import coal
 import numpy as np
-import pinocchio as pin
 import pytest
 
-from gym_mara.backends.dart import DartBackend
-from gym_mara.collision import make_checker
-from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.robot.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, shape_of
+from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from tests.helpers import joint_xml, urdf_xml, write
 
 TETRAHEDRON = """solid t
@@ -59,7 +54,7 @@ def _robot(folder: Path, shape: str, checking: str = "") -> RobotModel:
 
 
 def _shape(robot: RobotModel) -> Shape:
-    return shape_of(robot.model, robot.geometry.geometryObjects[0])
+    return robot.shapes[0]
 
 
 def _mesh_file(folder: Path) -> Path:
@@ -80,31 +75,11 @@ def test_round_shapes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("checking", ["", "convex"])
-def test_a_mesh_has_its_file_its_scale_and_scaled_vertices(tmp_path: Path, checking: str) -> None:
+def test_a_mesh_has_its_file_and_scaled_vertices(tmp_path: Path, checking: str) -> None:
     path = _mesh_file(tmp_path)
     shape = _shape(_robot(tmp_path, f'<mesh filename="{path}" scale="2 1 0.5"/>', checking))
     assert isinstance(shape, Mesh)
     assert shape.path == str(path)
     assert shape.convex == (checking == "convex")
-    np.testing.assert_array_equal(shape.scale, [2.0, 1.0, 0.5])
-    np.testing.assert_array_equal(shape.vertices.max(axis=0), shape.scale)
-
-
-def test_any_other_shape_is_an_error_that_names_link_and_shape(tmp_path: Path) -> None:
-    robot = _robot(tmp_path, '<sphere radius="0.1"/>')
-    frame = robot.model.getFrameId("link1", pin.FrameType.BODY)
-    cone = pin.GeometryObject("hat", 1, frame, pin.SE3.Identity(), coal.Cone(0.1, 0.2))
-    with pytest.raises(GymMaraError, match=r"link 'link1' has the shape Cone \('hat'\)"):
-        shape_of(robot.model, cone)
-
-
-def test_engines_without_convex_hulls_name_the_link(tmp_path: Path) -> None:
-    robot = _robot(tmp_path, f'<mesh filename="{_mesh_file(tmp_path)}"/>', "convex")
-    with pytest.raises(
-        GymMaraError, match="'fcl' does not support the convex hull of link 'link0'"
-    ):
-        make_checker("fcl", robot)
-    with pytest.raises(
-        GymMaraError, match="'dart' does not support the convex hull of link 'link0'"
-    ):
-        DartBackend(robot, 1)
+    np.testing.assert_array_equal(shape.vertices.max(axis=0), [2.0, 1.0, 0.5])
+    assert shape.faces.shape == (4, 3)

@@ -1,0 +1,1 @@
+"""Mesh files: where they are, what is checked in them, and the one reader."""

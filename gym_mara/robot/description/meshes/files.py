@@ -1,0 +1,104 @@
+"""Where the mesh files of a URDF are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gym_mara.errors import GymMaraError
+
+_SHOWN = 6
+"""The number of places that an error names."""
+
+
+def mesh_file(urdf: Path, name: str, package_dirs: Sequence[str]) -> Path:
+    """The file that a mesh's name means: an absolute path, file://…, package://… or a path beside the URDF.
+
+    The package of package://PACKAGE/PATH is a folder of that name in `package_dirs`, in a folder above the URDF, or along
+    ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; or `package_dirs` has the folder itself.
+
+    Raises:
+        GymMaraError: there is no such file.
+    """
+    places = candidates(urdf, name, package_dirs)
+    for place in places:
+        if os.path.lexists(place):
+            return place
+    shown = [str(place) for place in places[:_SHOWN]]
+    rest = f" and {len(places) - _SHOWN} more places" if len(places) > _SHOWN else ""
+    raise GymMaraError(
+        f"the mesh {name!r} of {str(urdf)!r} is not found; it was looked for at {', '.join(shown)}{rest}. "
+        f"{_advice(name, places)}"
+    )
+
+
+def candidates(urdf: Path, name: str, package_dirs: Sequence[str]) -> list[Path]:
+    """The places where a mesh may be, the first one first."""
+    _, _, rest = name.rpartition("://")
+    own = urdf.absolute().parent
+    if _is_absolute(name):
+        return [Path(rest)]
+    given = [Path(folder).absolute() for folder in package_dirs]
+    ros = [
+        Path(folder) / below
+        for variable, below in (("ROS_PACKAGE_PATH", ""), ("AMENT_PREFIX_PATH", "share"))
+        for folder in os.environ.get(variable, "").split(os.pathsep)
+        if folder
+    ]
+    _, _, inside = rest.partition("/")
+    # package_dirs may name the package's own folder, whatever its name is.
+    renamed = [folder / inside for folder in given] if "://" in name else []
+    folders = [*given, own, *own.parents, *ros]
+    return list(dict.fromkeys([*(folder / rest for folder in folders), *renamed]))
+
+
+def _is_absolute(name: str) -> bool:
+    scheme, _, rest = name.rpartition("://")
+    return scheme == "file" or (not scheme and Path(rest).is_absolute())
+
+
+def _advice(name: str, places: Sequence[Path]) -> str:
+    """What to do about a mesh that is at none of these places."""
+    for place in places:
+        if similar := _in_other_case(place):
+            return f"There is {str(similar)!r}: write its name in the same letter case"
+    if "\\" in name:
+        return "Write '/' between folders, not '\\'"
+    if _is_absolute(name):
+        return "A path of another machine must be changed in the URDF, to package://PACKAGE/PATH or a path beside the URDF"
+    if "://" not in name:
+        return (
+            "Put the file there, or give package_dirs=[…] the folder to which its path is relative"
+        )
+    if packages := _packages(name, places):
+        return f"The package is in {', '.join(map(repr, packages))}, without this file: add the file, or correct its name"
+    return "Give package_dirs=[…] the folder that holds the package, or set ROS_PACKAGE_PATH"
+
+
+def _packages(name: str, places: Sequence[Path]) -> list[str]:
+    """The folders of the package of package://PACKAGE/PATH that exist."""
+    _, _, rest = name.rpartition("://")
+    package, inside = rest.partition("/")[::2]
+    depth = len(Path(inside).parts)
+    found = {str(place.parents[depth - 1]) for place in places if "://" in name and depth}
+    return sorted(
+        folder for folder in found if Path(folder).name == package and Path(folder).is_dir()
+    )
+
+
+def _in_other_case(place: Path) -> Path | None:
+    """The file whose path differs by its letter case only."""
+    found = Path(place.anchor)
+    for part in place.parts[1:]:
+        if not os.path.lexists(found / part):
+            try:
+                names = os.listdir(found)
+            except OSError:
+                return None
+            same = (name for name in names if name.lower() == part.lower())
+            if (other := next(same, None)) is None:
+                return None
+            part = other
+        found /= part
+    return found

@@ -1,0 +1,172 @@
+"""Findings about joints: limits that are missing, zero or too low to hold the arm, and joints that follow others."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from gym_mara.errors import LARGEST
+from gym_mara.robot.description.off_chain import Follower
+from gym_mara.robot.diagnosis.finding import Finding, listed, parts
+from gym_mara.robot.diagnosis.sampling import random_configurations
+from gym_mara.types import Mask
+
+if TYPE_CHECKING:
+    from gym_mara.robot.model import RobotModel
+
+_NARROWEST = 1e-6
+"""A joint with a smaller range cannot move, rad (m)."""
+_POSES = 200
+"""The number of random poses in which the motors must hold the arm."""
+_LIGHTEST = 0.05
+"""A body with less mass and without shapes may be driven along unnoticed, kg."""
+_BEYOND = 1e-3
+"""A position this little beyond a limit is rounded, rad (m)."""
+
+
+def joint_findings(robot: RobotModel) -> list[Finding]:
+    """The findings about the joints of a loaded arm."""
+    return [*_frozen(robot), *_limits(robot), *_too_weak(robot), *_driven_along(robot)]
+
+
+def written_limits(root: ElementTree.Element) -> dict[str, dict[str, float]]:
+    """The position limits "lower" and "upper" that a URDF writes, by joint; continuous joints need none."""
+    limited = (j for j in root.findall("joint") if j.get("type") in ("revolute", "prismatic"))
+    return {
+        joint.get("name", ""): {
+            end: float(limit.get(end, "0")) for end in ("lower", "upper") if end in limit.attrib
+        }
+        for joint in limited
+        for limit in joint.findall("limit")
+    }
+
+
+def range_findings(
+    written: Mapping[str, Mapping[str, float]],
+    chain: Sequence[str],
+    followers: Sequence[Follower],
+    model: pin.Model,
+) -> list[Finding]:
+    """The findings about position limits that are not in a loaded arm any more.
+
+    Args:
+        written: the limits of the URDF, see `written_limits`.
+        chain: the names of the joints of the chain.
+        followers: the joints that mimic one of it.
+        model: Pinocchio's model.
+    """
+    findings = []
+    for end, other in ("lower", "upper"), ("upper", "lower"):
+        if names := [n for n in chain if len(written.get(n, {})) == 1 and end not in written[n]]:
+            remedy = f'Add {end}="…" to <limit>'
+            message = f"<limit> has {other}=, but no {end}="
+            findings.append(
+                Finding("warning", parts("joint", names), message, "it counts as 0", remedy)
+            )
+    beyond = []
+    for follower in followers:
+        ends = model.lowerPositionLimit[follower.leader], model.upperPositionLimit[follower.leader]
+        low, high = sorted(follower.multiplier * end + follower.offset for end in ends)
+        own = written.get(follower.name, {})
+        if low < own.get("lower", low) - _BEYOND or high > own.get("upper", high) + _BEYOND:
+            beyond.append(follower.name)
+    if beyond:
+        findings.append(
+            Finding(
+                "note",
+                parts("joint", beyond),
+                "the range of the joint that it mimics moves it beyond its own limits",
+                "its own limits do not count",
+                "Correct <limit> or <mimic>, unless this is meant",
+            )
+        )
+    return findings
+
+
+def _named(robot: RobotModel, which: Mask) -> list[str]:
+    return [robot.joint_names[joint] for joint in np.flatnonzero(which)]
+
+
+def _frozen(robot: RobotModel) -> Iterator[Finding]:
+    if still := _named(robot, robot.upper - robot.lower < _NARROWEST):
+        every = len(still) == robot.num_joints
+        yield Finding(
+            "error" if every else "warning",
+            parts("joint", still),
+            "the lower limit equals the upper limit, or both are missing",
+            "the arm cannot move" if every else "it never moves",
+            'Correct the limits, or make the joint type="continuous" or "fixed"',
+        )
+
+
+def _limits(robot: RobotModel) -> Iterator[Finding]:
+    """Limits of effort and velocity that are zero or missing."""
+    effects = {
+        "effort": ("Nm", "a motor without force holds nothing", "the motor is infinitely strong"),
+        "velocity": (
+            "rad/s",
+            "a joint without velocity stands still",
+            "it may be faster than a simulation can follow",
+        ),
+    }
+    for word, (unit, standing, endless) in effects.items():
+        limits = getattr(robot, f"{word}_limit")
+        for which, message, effect, verb in (
+            (limits <= 0.0, f"{word} limit 0", standing, "Correct"),
+            (limits >= LARGEST, f"no {word} limit", endless, "Add"),
+        ):
+            if names := _named(robot, which):
+                remedy = f"{verb} <limit>, or give {word}_limit=… ({unit})"
+                yield Finding(
+                    "error", parts("joint", names), message, effect, remedy, dynamics=True
+                )
+
+
+def _too_weak(robot: RobotModel) -> Iterator[Finding]:
+    """Motors that cannot hold the arm: at home, or only in other poses."""
+    model, data, limit = robot.model, robot.model.createData(), robot.effort_limit
+    poses = np.vstack([robot.home, random_configurations(robot, _POSES)])
+    weight = np.abs([pin.computeGeneralizedGravity(model, data, q).copy() for q in poses])
+    most, limited = weight.max(axis=0), (limit > 0.0) & (limit < LARGEST)
+    at_home = limited & (weight[0] > limit)
+    units = np.where(robot.kinematics().prismatic, "N", "Nm")
+    for which, where in (
+        (at_home, "in its start pose"),
+        (limited & (most > limit) & ~at_home, "in some poses"),
+    ):
+        if names := _named(robot, which):
+            efforts = [
+                f"{limit[joint]:.3g} < {most[joint]:.3g} {units[joint]}"
+                for joint in np.flatnonzero(which)
+            ]
+            yield Finding(
+                "warning",
+                parts("joint", names),
+                f"the effort limit is below the weight of the arm {where}: {listed(efforts)}",
+                "the arm drops",
+                "Correct <limit> or the masses, or give effort_limit=… (Nm)",
+                dynamics=True,
+            )
+
+
+def _driven_along(robot: RobotModel) -> Iterator[Finding]:
+    """Joints that follow others with a part of the arm that can touch something, or that weighs something."""
+    with_shapes = {each.parentJoint for each in robot.geometry.geometryObjects}
+    names = [
+        follower.name
+        for number, follower in enumerate(robot.followers, robot.num_joints + 1)
+        if number in with_shapes or robot.model.inertias[number].mass >= _LIGHTEST
+    ]
+    if names:
+        yield Finding(
+            "note",
+            parts("joint", names),
+            "mimics a joint of the chain",
+            "DART moves it along whatever it touches, and that joint feels no load of it",
+            "Nothing is to do, unless it must grasp",
+            dynamics=True,
+        )
