@@ -64,10 +64,10 @@ def test_the_exit_code_says_whether_the_arm_works_on_the_backend(
     assert mended[1]["findings"] == []
 
 
-def test_an_arm_that_cannot_move_is_shown_and_fails(gym_mara: Cli, tmp_path: Path) -> None:
+def test_an_arm_that_cannot_move_is_shown_with_a_warning(gym_mara: Cli, tmp_path: Path) -> None:
     urdf = arm_file(tmp_path, arm(limit='<limit effort="1" velocity="1"/>'))
     code, out, _ = gym_mara("robot", urdf, "--ee-frame", TOOL)
-    assert code == 1
+    assert code == 0
     assert "the arm cannot move" in out
     assert "j3" in out
 

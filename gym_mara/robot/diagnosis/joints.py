@@ -95,7 +95,7 @@ def _frozen(robot: RobotModel) -> Iterator[Finding]:
     if still := _named(robot, robot.upper - robot.lower < _NARROWEST):
         every = len(still) == robot.num_joints
         yield Finding(
-            "error" if every else "warning",
+            "warning",
             parts("joint", still),
             "the lower limit equals the upper limit, or both are missing",
             "the arm cannot move" if every else "it never moves",
