@@ -89,7 +89,7 @@ def miss(robot: RobotModel, backend: str) -> str:
     for _ in range(STEPS):
         info = env.step(path[-1])[-1]
     env.close()
-    return f"{1000.0 * info['position_error']:.0f}"
+    return f"{1000.0 * info['position_error']:,.0f}"
 
 
 def compiles_in_mujoco(robot: RobotModel) -> str:
