@@ -40,7 +40,10 @@ def test_an_interrupted_training_says_what_is_saved(
 ) -> None:
     run, errors = tmp_path / "run", tmp_path / "errors"
     command = [*GYM_MARA, "train", "--steps", "1e7", "--checkpoint-every", every, "--out", str(run)]
-    code = f"import sys; sys.stderr = open({str(errors)!r}, 'w'); sys.argv = {command[1:]!r}; "
+    # A signal that is ignored, as SIGHUP where the tests run under nohup, would stay ignored.
+    usual = "default_int_handler" if number == signal.SIGINT else "SIG_DFL"
+    code = f"import signal, sys; signal.signal({int(number)}, signal.{usual}); "
+    code += f"sys.stderr = open({str(errors)!r}, 'w'); sys.argv = {command[1:]!r}; "
     code += "from gym_mara.cli import main; main()"
     wanted = run / ("config.json" if every == "1e6" else "checkpoints/512")
     with started("-c", code) as training:

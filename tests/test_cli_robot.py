@@ -123,12 +123,15 @@ def test_a_robot_of_the_catalogue(gym_mara: Cli) -> None:
     assert found["default_target"]["position"] == [-0.40028, 0.095615, 0.72466]
 
 
-def test_a_written_srdf_is_read_the_next_time(gym_mara: Cli, tmp_path: Path) -> None:
+def test_a_written_srdf_is_read_from_then_on(gym_mara: Cli, tmp_path: Path) -> None:
     urdf = arm_file(tmp_path, arm(origins=FOLDED))
+    elsewhere = "--write-srdf", tmp_path / "other.srdf"
+    _, out, _ = gym_mara("robot", urdf, "--ee-frame", TOOL, *elsewhere)
+    assert "they touch in the start pose, but not in all poses" in out
     write_srdf = "--write-srdf", tmp_path / "arm.srdf"
     code, out, err = gym_mara("robot", urdf, "--ee-frame", TOOL, *write_srdf)
     assert code == 0
-    assert "they touch in the start pose, but not in all poses" in out
+    assert "Nothing is wrong with the files" in out
     assert "are disabled: " in err
     assert "Adjacent 3" in err
     assert _json(gym_mara, urdf)[1]["findings"] == []

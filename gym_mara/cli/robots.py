@@ -92,6 +92,8 @@ def robot(
     arm = _inspected(file, ee_frame, options)
     if write_srdf is not None:
         _write_srdf(arm, write_srdf)
+        if write_srdf.absolute() == arm.urdf.absolute().with_suffix(".srdf"):
+            arm = _inspected(file, ee_frame, options)  # which reads the new SRDF
     found = report(arm, names)
     if picture is not None:
         _draw(arm, found["default_target"], picture)
@@ -165,7 +167,7 @@ def _require_frame(urdf: Path, root: ElementTree.Element) -> None:
 def _write_srdf(arm: RobotModel, file: Path) -> None:
     with written_aside(file, new=True) as temporary:
         disabled = disabled_pairs(arm)
-        temporary.write_text(srdf_text(arm, disabled), encoding="utf-8")
+        temporary.write_bytes(srdf_text(arm, disabled).encode())
     counts = ", ".join(f"{reason} {count}" for reason, count in Counter(disabled.values()).items())
     err.print(f"{file}: {len(disabled)} pairs of links are disabled: {counts}", soft_wrap=True)
 

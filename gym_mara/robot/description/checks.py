@@ -22,15 +22,13 @@ import numpy as np
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import plain_size
 from gym_mara.robot.description.joints import link_at
-from gym_mara.robot.description.meshes.files import candidates
+from gym_mara.robot.description.meshes.files import LARGEST_MESHES, candidates
 from gym_mara.robot.diagnosis import Finding, Severity
 
 # More than any robot has; the number of pairs of shapes grows with the square.
 _MOST = {"link": 1000, "joint": 1000, "collision": 500}
 _LARGEST_NUMBER = 1e12
 """Of a URDF: the products of larger ones may overflow."""
-_LARGEST_MESHES = 2**30
-"""The size of all mesh files of a robot together, bytes."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 """As C++ reads them: Python's float accepts more."""
 _LEAST_INERTIA = -1e-9
@@ -149,9 +147,9 @@ def check_urdf(
         raise GymMaraError(f"{str(urdf)!r}: {error}") from None
     names = {mesh.get("filename", "") for mesh in root.iter("mesh")} - {""}
     places = (place for name in names for place in candidates(urdf, name, package_dirs))
-    if sum(plain_size(place) for place in places if os.path.lexists(place)) > _LARGEST_MESHES:
+    if sum(plain_size(place) for place in places if os.path.lexists(place)) > LARGEST_MESHES:
         raise GymMaraError(
-            f"the meshes of {str(urdf)!r} are larger than {_LARGEST_MESHES:,} bytes together"
+            f"the meshes of {str(urdf)!r} are larger than {LARGEST_MESHES:,} bytes together"
         )
     return findings
 

@@ -12,6 +12,8 @@ from gym_mara.errors import GymMaraError
 Severity = Literal["error", "warning", "note"]
 _SHOWN = 10
 """The number of names that a finding lists, unless it says otherwise."""
+_warned: set[tuple[str, Finding]] = set()
+"""The findings of files of which was warned: a program loads the same files many times, a training three times."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def raise_errors(name: str, findings: Iterable[Finding], *, dynamics: bool) -> N
 
 
 def warn(source: str, findings: Iterable[Finding], *, dynamics: bool, stacklevel: int) -> None:
-    """Warn of each warning among findings: those of backends with dynamics, or those of every backend.
+    """Warn of each warning among findings, once in a process: those of backends with dynamics, or those of every backend.
 
     Args:
         source: the file that they are about.
@@ -60,7 +62,10 @@ def warn(source: str, findings: Iterable[Finding], *, dynamics: bool, stacklevel
         stacklevel: 1 for the caller of this function, 2 for its caller, and so on.
     """
     for finding in findings:
-        if finding.severity == "warning" and finding.dynamics == dynamics:
+        if finding.severity != "warning" or finding.dynamics != dynamics:
+            continue
+        if (source, finding) not in _warned:
+            _warned.add((source, finding))
             warnings.warn(f"{source}: {finding}", stacklevel=stacklevel + 1)
 
 

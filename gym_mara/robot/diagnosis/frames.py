@@ -6,8 +6,10 @@ import re
 import xml.etree.ElementTree as ElementTree
 from typing import NamedTuple
 
-_TOOL = re.compile(r"tool|tcp|end_?eff|(^|_)eef?(_|$)|grasp|hand", re.IGNORECASE)
+_TOOL = re.compile(r"tool|tcp|end_?eff|(^|_)eef?(_|$)|grasp|grip|hand", re.IGNORECASE)
 """In names of frames that are made for the tool."""
+_FINGER = re.compile(r"finger|jaw|claw|knuckle", re.IGNORECASE)
+"""In names of a gripper's moving parts."""
 
 
 class Frame(NamedTuple):
@@ -41,9 +43,10 @@ def candidate_frames(root: ElementTree.Element) -> list[Frame]:
     frames = [frame for frame in frames if frame.joints and 2 * frame.joints >= most]
     palm = _palm([frame.link for frame in frames if frame.joints == most], parents)
 
-    def rank(frame: Frame) -> tuple[bool, bool, int, bool]:
+    def rank(frame: Frame) -> tuple[bool, bool, bool, int, bool]:
         named = bool(_TOOL.search(frame.link)) and frame.joints >= most - 1
-        return named, frame.link == palm, frame.joints, frame.last
+        body = not _FINGER.search(frame.link)
+        return body, named, frame.link == palm, frame.joints, frame.last
 
     return sorted(frames, key=rank, reverse=True)
 

@@ -43,7 +43,7 @@ def test_an_arm_has_as_many_joints_as_its_motors_turn_faces(joints: int) -> None
 
 
 def test_the_page_says_how_many_joints_a_list_of_modules_makes() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "add_a_robot.md"
+    page = Path(__file__).resolve().parents[3] / "docs" / "add_a_robot.md"
     [(modules, joints)] = re.findall(r"--set 'robot=(\[.*\])' +# (\d) joints", page.read_text())
     assert RobotModel.load(json.loads(modules)).num_joints == int(joints)
 

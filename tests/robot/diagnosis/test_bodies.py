@@ -95,13 +95,12 @@ def test_a_rounded_inertia_is_no_warning(tmp_path: Path) -> None:
 
 def test_an_arm_warns_once_whatever_is_made_of_it(tmp_path: Path) -> None:
     robot = RobotModel.load(arm_file(tmp_path, HEAVY), TOOL, **STRONG)
-    not_yet = pickled(robot)
-    for first in (robot, not_yet):
-        with pytest.warns(UserWarning, match="kg"):
-            first.require_dynamics()
+    with pytest.warns(UserWarning, match="kg"):
+        robot.require_dynamics()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         robot.require_dynamics()
+        RobotModel.load(robot.urdf, TOOL, **STRONG).require_dynamics()
         pickled(robot).require_dynamics()
         RobotModel.inspect(robot.urdf, TOOL, **STRONG).require_dynamics()
 

@@ -37,6 +37,12 @@ def test_the_palm_is_offered_before_its_fingers() -> None:
     assert _candidates(text)[0].link == "link3"
 
 
+def test_the_gripper_is_offered_before_its_only_jaw() -> None:
+    jaw = '<link name="jaw"/><joint name="j" type="revolute"><parent link="gripper"/><child link="jaw"/></joint>'
+    text = urdf_xml(*map(joint_xml, range(3))).replace("link3", "gripper")
+    assert _candidates(text.replace("</robot>", f"{jaw}</robot>"))[0].link == "gripper"
+
+
 def test_a_urdf_without_joints_has_no_frames() -> None:
     assert _candidates('<robot name="block"><link name="block"/></robot>') == []
 

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gym_mara.files import read_bytes
+from gym_mara.robot.description.meshes.files import LARGEST_MESHES
 from gym_mara.types import Floats
 
 
@@ -38,7 +40,7 @@ def check_obj(path: Path) -> Checked:
         ValueError: a vertex is not finite, or a face has fewer than three vertices or a missing one.
     """
     vertices = last = triangles = 0
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    text = read_bytes(path, LARGEST_MESHES).decode("utf-8", "replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         kind, *values = line.partition("#")[0].split() or [""]
         if kind == "v":
@@ -62,7 +64,7 @@ def check_ply(path: Path) -> Checked:
     Raises:
         ValueError: it has fewer.
     """
-    header, end, body = path.read_bytes().partition(b"end_header")
+    header, end, body = read_bytes(path, LARGEST_MESHES).partition(b"end_header")
     if end and b"format ascii" in header:
         elements = sum(int(count) for count in re.findall(rb"element \w+ (\d+)", header))
         if len(body.split(b"\n")) - 1 < elements:

@@ -10,6 +10,8 @@ from gym_mara.errors import GymMaraError
 
 _SHOWN = 6
 """The number of places that an error names."""
+LARGEST_MESHES = 2**30
+"""The size of all mesh files of a robot together, bytes."""
 
 
 def mesh_file(urdf: Path, name: str, package_dirs: Sequence[str]) -> Path:

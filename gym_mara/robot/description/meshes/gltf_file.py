@@ -10,8 +10,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from gym_mara.files import plain_size
+from gym_mara.files import plain_size, read_bytes
 from gym_mara.robot.description.meshes.checks import Checked
+from gym_mara.robot.description.meshes.files import LARGEST_MESHES
 
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From glTF's y-up to the z-up of robots."""
@@ -54,7 +55,7 @@ def check_gltf(path: Path) -> Checked:
 
 def _tree(path: Path) -> Json:
     """The JSON of a file."""
-    content = path.read_bytes()
+    content = read_bytes(path, LARGEST_MESHES)
     if content[:4] == b"glTF":
         sizes = np.frombuffer(content[:20].ljust(20, b"\0"), "<u4")
         if len(content) < int(sizes[2]):
@@ -129,5 +130,5 @@ def _buffers(path: Path, tree: Json) -> dict[str, bytes]:
         file = path.parent / unquote(name)
         if plain_size(file) < buffer["byteLength"]:
             raise ValueError(f"{str(file)!r} is cut off")
-        contents[name] = file.read_bytes()
+        contents[name] = read_bytes(file, LARGEST_MESHES)
     return contents
