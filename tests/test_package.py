@@ -1,0 +1,15 @@
+"""The wheel: that it has every folder of the package."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_wheel_has_every_folder_with_modules() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.findall(r'"([\w.]+)"', text.split("packages = [")[1].split("]")[0])
+    folders = {file.parent.relative_to(ROOT) for file in (ROOT / "gym_mara").rglob("*.py")}
+    assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + ["gym_mara.robots"])
