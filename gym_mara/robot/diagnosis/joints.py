@@ -134,13 +134,13 @@ def _too_weak(robot: RobotModel) -> Iterator[Finding]:
     most, limited = weight.max(axis=0), (limit > 0.0) & (limit < LARGEST)
     at_home = limited & (weight[0] > limit)
     units = np.where(robot.kinematics().prismatic, "N", "Nm")
-    for which, where in (
-        (at_home, "in its start pose"),
-        (limited & (most > limit) & ~at_home, "in some poses"),
+    for which, where, needed in (
+        (at_home, "in its start pose", weight[0]),
+        (limited & (most > limit) & ~at_home, "in some poses", most),
     ):
         if names := _named(robot, which):
             efforts = [
-                f"{limit[joint]:.3g} < {most[joint]:.3g} {units[joint]}"
+                f"{limit[joint]:.3g} < {needed[joint]:.3g} {units[joint]}"
                 for joint in np.flatnonzero(which)
             ]
             yield Finding(

@@ -101,6 +101,12 @@ def _lying(effort: float) -> str:
     return arm(origins=flat, limit=LIMIT.replace("50", str(effort)))
 
 
+def test_the_weight_in_the_start_pose_is_that_of_the_start_pose(tmp_path: Path) -> None:
+    text = _lying(3.0).replace("1.57079633", "1.2")  # 5.886 Nm · sin 1.2
+    with pytest.warns(UserWarning, match=r"joint j2: .* in its start pose: 3 < 5\.49 Nm"):
+        RobotModel.load(arm_file(tmp_path, text), TOOL).require_dynamics()
+
+
 def test_a_motor_that_cannot_hold_the_arm_at_home_is_a_warning(tmp_path: Path) -> None:
     robot = RobotModel.load(arm_file(tmp_path, _lying(3.0)), TOOL)
     with pytest.warns(UserWarning, match=r"joint j2: .* in its start pose: 3 < 5\.89 Nm") as warned:
