@@ -83,13 +83,13 @@ class RobotModel:
         A RobotModel is returned as it is. Warns of what is probably not meant, see `findings`.
 
         Args:
-            robot: the robot. A path ends in ".urdf" or ".xml"; NAME.srdf and NAME.target.json beside NAME.urdf are read
-                too.
+            robot: the robot. A path ends in ".urdf" or ".xml", or has a folder ("./arm"); NAME.srdf and NAME.target.json
+                beside NAME.urdf are read too.
             ee_frame: the end-effector link; by default the catalogue's, or the one that the SRDF names.
             **options: fields of `RobotOptions`.
 
         Raises:
-            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm that can move.
+            GymMaraError: the name is unknown, or the URDF does not describe a fixed-base arm.
             MissingExtraError: the robot's files come with a package that is not installed.
         """
         loaded = cls.inspect(robot, ee_frame, **options)
@@ -99,7 +99,7 @@ class RobotModel:
     def inspect(
         cls, robot: RobotLike | Path, ee_frame: str | None = None, **options: Any
     ) -> RobotModel:
-        """Load a robot as `load` does, but neither raise nor warn by its findings.
+        """Load a robot as `load` does, but do not warn of its findings.
 
         Raises:
             GymMaraError: the robot cannot be read at all.
@@ -182,8 +182,7 @@ class RobotModel:
         return from_modules(cls, modules, RobotOptions(**options))
 
     def _checked(self) -> RobotModel:
-        """This robot; raises and warns by its findings, in the name of the caller of the calling method."""
-        raise_errors(self.name, self.findings, dynamics=False)
+        """This robot; warns of its findings, in the name of the caller of the calling method."""
         warn(repr(str(self.urdf)), self.findings, dynamics=False, stacklevel=3)
         object.__setattr__(self, "_unwarned", True)
         return self
@@ -211,7 +210,7 @@ class RobotModel:
         Raises:
             GymMaraError: they cannot; it says why, and what to do.
         """
-        raise_errors(self.name, self.findings, dynamics=True)
+        raise_errors(self.name, self.findings)
         if self._unwarned:
             object.__setattr__(self, "_unwarned", False)
             warn(repr(str(self.urdf)), self.findings, dynamics=True, stacklevel=2)

@@ -46,7 +46,6 @@ class RobotOptions:
             mass = positive_number("default_mass", self.default_mass, "kg", at_least=1e-6)
             object.__setattr__(self, "default_mass", mass)
         object.__setattr__(self, "convex_hulls", flag("convex_hulls", self.convex_hulls))
-
         for name in ("effort_limit", "velocity_limit"):
             object.__setattr__(self, name, _per_joint(name, getattr(self, name)))
 
@@ -116,8 +115,7 @@ def with_paths(options: dict[str, Any], moved: Callable[[str], str]) -> dict[str
     changed = dict(options)
     if is_path(robot := options.get("robot")):
         changed["robot"] = replaced(os.fspath(robot))
-    if isinstance(
-        folders := options.get("package_dirs"), (list, tuple)
-    ):  # others are refused later
+    folders = options.get("package_dirs")
+    if isinstance(folders, (list, tuple)):  # others are refused later
         changed["package_dirs"] = [replaced(folder) for folder in folders]
     return changed

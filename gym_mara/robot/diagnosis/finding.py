@@ -38,16 +38,16 @@ class Finding:
         return f"{self.part}: {self.message}; {where}{self.effect}. {self.remedy}"
 
 
-def raise_errors(name: str, findings: Iterable[Finding], *, dynamics: bool) -> None:
-    """Raise the errors among findings: those of backends with dynamics, or those of every backend.
+def raise_errors(name: str, findings: Iterable[Finding]) -> None:
+    """Raise the errors among findings, which are about dynamics: what no backend can simulate is refused when it is read.
 
     Raises:
         GymMaraError: there are any.
     """
-    errors = [f for f in findings if f.severity == "error" and f.dynamics == dynamics]
+    errors = [f for f in findings if f.severity == "error"]
     if errors:
         raise GymMaraError(
-            f"the robot {name!r} cannot be simulated{' with dynamics' if dynamics else ''}:\n"
+            f"the robot {name!r} cannot be simulated with dynamics:\n"
             + "\n".join(f"- {finding}" for finding in errors)
         )
 
