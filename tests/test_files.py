@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import ast
 import os
-import resource
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -35,15 +33,6 @@ ROOT = Path(__file__).resolve().parents[1]
 class Form:
     name: str
     steps: Annotated[int, Ge(1)]
-
-
-@pytest.fixture
-def small_files() -> Iterator[None]:
-    """Files of this process may have at most 1,000 bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_pipe_a_device_and_a_folder_are_refused_at_once(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +38,6 @@ def folder(tmp_path: Path) -> Path:
         (folder / name / "progress.csv").write_text(PROGRESS)
         (folder / name / "result.json").write_text(json.dumps(RESULT))
     return folder
-
-
-@pytest.fixture
-def small_files() -> Iterator[None]:
-    """Files of this process may have at most 4,000 bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def names(folder: Path) -> set[str]:

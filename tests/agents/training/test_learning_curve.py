@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,15 +23,6 @@ def run(tmp_path: Path) -> RunFolder:
     run = RunFolder(tmp_path, config())
     run.progress_file.write_text(PROGRESS)
     return run
-
-
-@pytest.fixture
-def small_files() -> Iterator[None]:
-    """Files of this process may have at most 4,000 bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_learning_curve_is_a_picture(run: RunFolder) -> None:
