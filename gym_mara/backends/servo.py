@@ -1,14 +1,23 @@
-"""What dynamic backends share: position servos, planned one control period ahead, and arms whose state can diverge."""
+"""What dynamic backends share: position servos, random parameters, latency, and arms whose state can diverge."""
 
 from __future__ import annotations
 
 import copy
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gym_mara.backends.base import Backend, limited_velocity
+from gym_mara.backends.randomisation import Randomisation
+from gym_mara.backends.servo_motion import (
+    has_diverged,
+    late_servo_motion,
+    servo_motion,
+    step_times,
+)
 from gym_mara.errors import GymMaraError, one_of, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
@@ -16,11 +25,9 @@ from gym_mara.state import Contact, SimState
 from gym_mara.types import Floats, Mask
 
 ON_DIVERGENCE = ("error", "truncate")
-DIVERGED_VELOCITY = 1e3
-"""A joint this many times as fast as its limit has diverged."""
-MOST_PHYSICS_STEPS = 10_000
-"""The largest number of physics steps in a control period."""
-_STATE = ("q", "qd", "torque", "contacts", "time", "diverged", "parameters")
+MOST_LATE_PERIODS = 1000
+"""The longest latency, control periods."""
+_STATE = ("q", "qd", "torque", "contacts", "time", "diverged", "parameters", "targets")
 
 
 class SimulationDivergedError(GymMaraError):
@@ -46,7 +53,7 @@ class ServoBackend(Backend):
     Each joint has a position servo: its motor is commanded the velocity clip(gain · (target - q), ± the limit of velocity)
     at every physics step, and exerts what torque that takes, up to the effort limit. Joints have end stops at their limits.
     The state has the engine's joint positions, and its velocities clipped to the limits. A subclass adds the engine: it
-    implements `_run`, `_put_at_rest` and `_rebuild`, and calls `reset` at the end of its constructor.
+    implements `_run`, `_put_at_rest`, `_rebuild` and `_set_parameters`, and calls `reset` at the end of its constructor.
 
     Args:
         robot: the arm.
@@ -56,6 +63,8 @@ class ServoBackend(Backend):
         max_joint_velocity: rad/s (m/s), where it is below the URDF's limits; None for those.
         servo_gain: 1/s.
         on_divergence: what follows when an arm's state diverges: "error", or "truncate" to end the arm's episode.
+        randomisation: name → (lowest, highest), drawn for each arm at the beginning of each episode; see
+            `gym_mara.backends.randomisation`.
 
     Raises:
         GymMaraError: a setting is out of its range.
@@ -75,6 +84,7 @@ class ServoBackend(Backend):
         max_joint_velocity: float | None = None,
         servo_gain: float = 10.0,
         on_divergence: str = "error",
+        randomisation: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
         self._settings: dict[str, Any] = {
@@ -83,6 +93,7 @@ class ServoBackend(Backend):
             "max_joint_velocity": max_joint_velocity,
             "servo_gain": servo_gain,
             "on_divergence": on_divergence,
+            "randomisation": randomisation,
         }
         """The keyword arguments that make the same backend again; a subclass adds its own."""
         self.physics_step = positive_number("physics_step", physics_step, "s")
@@ -91,6 +102,8 @@ class ServoBackend(Backend):
             self.joint_velocity = limited_velocity(robot, max_joint_velocity)
         self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
+        self.randomisation = Randomisation({} if randomisation is None else randomisation, robot)
+        self.random = bool(self.randomisation.ranges)
         self._kinematics = robot.kinematics()
         shape = (num_envs, robot.num_joints)
         self._gain = np.full(shape, self.servo_gain)
@@ -99,28 +112,63 @@ class ServoBackend(Backend):
         self._contacts: list[tuple[Contact, ...]] = [()] * num_envs
         self._time = np.zeros(num_envs)
         self._diverged = np.zeros(num_envs, np.bool_)
-        self._parameters: dict[str, Floats] = {}
+        self._parameters = {
+            name: np.repeat(value[None], num_envs, axis=0)
+            for name, value in self.randomisation.nominal().items()
+        }
+        # The latest targets (N, D, J), the newest last: as many as the longest latency needs.
+        self._targets = np.stack([self._q] * (self._late_periods() + 2), axis=1)
+        self._latency = np.zeros((num_envs, 1))
+
+    def _late_periods(self) -> int:
+        """The number of whole control periods in the longest latency."""
+        longest = self.randomisation.ranges.get("latency", (0.0, 0.0))[1]
+        if longest / self.control_period > MOST_LATE_PERIODS:
+            raise GymMaraError(
+                f"the latency must be at most {MOST_LATE_PERIODS} control periods of {self.control_period:g} s, because "
+                f"the targets of that time are kept; not {longest:g} s"
+            )
+        return int(longest // self.control_period)
 
     @abstractmethod
     def _run(self, velocities: Floats) -> Motion:
         """Run all arms for one physics step per row of commanded joint velocities (K, N, J)."""
 
     @abstractmethod
-    def _put_at_rest(self, arm: int, q: Floats) -> tuple[Contact, ...]:
-        """Put one arm at rest at q (J,); returns the contacts there."""
+    def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
+        """Put the n arms with these numbers at rest at q (n, J); returns the contacts of each there."""
 
     @abstractmethod
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         """Replace what the engine knows of one arm, whose state diverged, by a new arm at q and qd, both (J,)."""
 
+    @abstractmethod
+    def _set_parameters(self, arm: int, parameters: Mapping[str, Floats]) -> None:
+        """Give one arm its random parameters (those of its episode); latency and servo gain are not the engine's."""
+
+    def begin_episodes(self, seeds: NDArray[np.uint64], mask: Mask) -> None:
+        for arm in np.flatnonzero(mask).tolist():
+            for name, value in self.randomisation.draw(int(seeds[arm])).items():
+                self._parameters[name][arm] = value
+            self._apply_parameters(arm)
+
+    def _apply_parameters(self, arm: int) -> None:
+        own = {name: values[arm] for name, values in self._parameters.items()}
+        self._gain[arm] = self.servo_gain * own.get("servo_gain", 1.0)
+        self._latency[arm] = own.get("latency", 0.0)
+        self._set_parameters(arm, own)
+
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         rows = np.ones(self.num_envs, np.bool_) if mask is None else mask
-        for arm in np.flatnonzero(rows).tolist():
-            self._contacts[arm] = self._put_at_rest(arm, q[arm])
+        arms = np.flatnonzero(rows)
+        for arm, contacts in zip(arms.tolist(), self._put_at_rest(arms, q[arms]), strict=True):
+            self._contacts[arm] = contacts
         self._q[rows], self._qd[rows], self._torque[rows] = q[rows], 0.0, 0.0
+        self._targets[rows] = q[rows, None]
         self._time[rows], self._diverged[rows] = 0.0, False
 
     def step(self, q_target: Floats) -> SimState:
+        self._targets = np.concatenate([self._targets[:, 1:], q_target[:, None]], axis=1)
         motion = self._run(self._commands(q_target))
         self._time += self.control_period
         self._diverged = has_diverged(motion.q, motion.qd, self.joint_velocity)
@@ -131,7 +179,16 @@ class ServoBackend(Backend):
 
     def _commands(self, q_target: Floats) -> Floats:
         """The velocities that the servos command at each physics step of the next control period (K, N, J)."""
-        path = servo_motion(self._q, q_target, self._gain, self.joint_velocity, self._times)
+        limits = self._gain, self.joint_velocity
+        if "latency" in self._parameters:
+            # A target is late by whole periods, and takes effect at a time within this one.
+            late = self._latency // self.control_period
+            change = self._latency - late * self.control_period
+            arms, newest = np.arange(self.num_envs), -1 - late[:, 0].astype(np.int64)
+            both = self._targets[arms, newest - 1], self._targets[arms, newest]
+            path = late_servo_motion(self._q, both, *limits, self._times, change)
+        else:
+            path = servo_motion(self._q, q_target, *limits, self._times)
         return (path[1:] - path[:-1]) / self.physics_step
 
     def _go_back(self, motion: Motion) -> None:
@@ -178,6 +235,8 @@ class ServoBackend(Backend):
         check_fits("backend", {name: snapshot.get(name) for name in _STATE}, form)
         for name in _STATE:
             setattr(self, f"_{name}", copy.deepcopy(snapshot[name]))
+        for arm in range(self.num_envs if self.random else 0):
+            self._apply_parameters(arm)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self.robot, self.num_envs, self._settings, self.save())
@@ -193,57 +252,3 @@ def _restored(
     made = backend(robot, num_envs, **settings)
     made.restore(snapshot)
     return made
-
-
-def has_diverged(q: Floats, qd: Floats, velocity_limit: Floats) -> Mask:
-    """Which arms have a state, q and q̇ (..., J), that is not finite or is far beyond the velocity limits (J,)."""
-    sane = np.isfinite(q) & (np.abs(qd) < DIVERGED_VELOCITY * velocity_limit)
-    return np.logical_not(np.logical_and.reduce(sane, axis=-1))
-
-
-def step_times(control_period: float, physics_step: float) -> Floats:
-    """The times between the physics steps of a control period, from 0 to the period (K + 1,), s.
-
-    Raises:
-        GymMaraError: a control period is not a whole number of physics steps, or has too many.
-    """
-    if control_period / physics_step > MOST_PHYSICS_STEPS:
-        raise GymMaraError(
-            f"a control period of {control_period:g} s must have at most {MOST_PHYSICS_STEPS} physics steps, because a step "
-            f"of the environment computes them all; with physics_step {physics_step:g} s it has {control_period / physics_step:g}"
-        )
-    steps = round(control_period / physics_step)
-    if steps < 1 or abs(steps * physics_step - control_period) > 1e-9:
-        raise GymMaraError(
-            f"physics_step {physics_step} s must divide the control period, {control_period} s, "
-            f"as {control_period / max(steps, 1):g} s does"
-        )
-    return physics_step * np.arange(steps + 1, dtype=np.float64)
-
-
-def servo_motion(
-    q: Floats, q_target: Floats, gain: Floats, velocity_limit: Floats, time: Floats
-) -> Floats:
-    """How far joints have moved at a time under the law q̇ = clip(gain · (q_target - q), ±velocity_limit).
-
-    A joint moves at the limit as long as the law asks for more, then approaches its target exponentially: it does not
-    overshoot.
-
-    Args:
-        q: current positions (..., J), rad.
-        q_target: target positions (..., J), rad.
-        gain: 1/s, (..., J).
-        velocity_limit: rad/s, (..., J).
-        time: from now, s; broadcasts against the others.
-
-    Returns:
-        The displacements, rad, of the broadcast shape.
-    """
-    way = q_target - q
-    slow_zone = velocity_limit / gain  # within this distance the law asks for less than the limit
-    distance = np.abs(way)
-    slow_way = np.minimum(distance, slow_zone)
-    fast_time = (distance - slow_way) / velocity_limit
-    fast = np.minimum(time, fast_time)
-    slow = slow_way * np.expm1(gain * (fast - time))
-    return np.copysign(fast * velocity_limit - slow, way)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from gym_mara.backends.servo import (
-    Motion,
-    ServoBackend,
-    SimulationDivergedError,
-    has_diverged,
-    servo_motion,
-)
+from gym_mara.backends.servo import Motion, ServoBackend, SimulationDivergedError
+from gym_mara.backends.servo_motion import has_diverged, servo_motion
 from gym_mara.robot import RobotModel
 from gym_mara.state import Contact
 from gym_mara.types import Floats
@@ -78,8 +75,11 @@ class IdealEngine(ServoBackend):
         qd[qd[:, 0] > 1.0] = np.nan
         return Motion(q, qd, torque=qd.copy(), contacts=[()] * len(q))
 
-    def _put_at_rest(self, arm: int, q: Floats) -> tuple[Contact, ...]:
-        return (Contact(("a", "b"), 0.1),) if q[0] > 1.0 else ()
+    def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
+        return [(Contact(("a", "b"), 0.1),) if row[0] > 1.0 else () for row in q]
+
+    def _set_parameters(self, arm: int, parameters: Mapping[str, Floats]) -> None:
+        """This engine has none."""
 
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         self.placed.append((arm, q.copy(), qd.copy()))

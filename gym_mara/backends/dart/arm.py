@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.backends.dart.shapes import Detector
-from gym_mara.backends.servo import has_diverged
+from gym_mara.backends.servo_motion import has_diverged
 from gym_mara.collision.base import CollisionChecker, NoChecker
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.extras import needs

@@ -1,0 +1,1 @@
+"""The dynamic backend on MuJoCo."""
