@@ -55,6 +55,14 @@ class Backend(ABC):
         )
         self.joint_velocity = robot.velocity_limit
 
+    @classmethod  # noqa: B027 - most need nothing special
+    def require_machine(cls) -> None:
+        """Check that this machine has what the engine needs unless its settings say otherwise, such as a GPU.
+
+        Raises:
+            GymMaraError: it has not.
+        """
+
     @abstractmethod
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         """Put all arms, or those of the mask (N,), at rest at their rows of q (N, J), rad, and set their time to zero."""
