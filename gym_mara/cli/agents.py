@@ -186,10 +186,10 @@ def transfer(
         print(json.dumps(found, indent=2))
         return
     titles = [
-        ",\n".join([row.backend, *(f"{name}={value}" for name, value in row.settings.items())])
+        ",\n".join([row.backend, *(f"{name}\n= {value}" for name, value in row.settings.items())])
         for row in rows
     ]
-    columns = (Column(title, justify="right") for title in titles)
+    columns = (Column(title, justify="right", overflow="fold") for title in titles)
     table = Table("", *columns, title=", ".join([folder.config.env, f"{policy} policy", *settings]))
     for name, unit in _UNITS.items():
         if name in rows[0].metrics:
