@@ -25,7 +25,7 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms run faster in several processes: true for an engine that holds Python's lock while it steps."""
-    dynamic: ClassVar[bool] = False
+    dynamic: bool = False
     """Whether masses and forces count, so that the robot's must be right."""
     most_arms: ClassVar[int] = 2**20
     """The largest number of arms: with more, an ordinary machine runs out of memory."""

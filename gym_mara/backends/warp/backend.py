@@ -71,6 +71,7 @@ class WarpBackend(Backend):
         SimulationDivergedError: from `step`, where an arm's state diverges and `on_divergence` is "error".
     """
 
+    dynamic = True
     precision = np.float32
 
     def __init__(
@@ -88,6 +89,7 @@ class WarpBackend(Backend):
         device: str | None = None,
         max_contacts: int = 24,
     ) -> None:
+        self.dynamic = flag("dynamics", dynamics)
         super().__init__(robot, num_envs, control_period=control_period)
         self._settings: dict[str, Any] = {
             "control_period": control_period,
@@ -100,7 +102,6 @@ class WarpBackend(Backend):
             "device": device,
             "max_contacts": max_contacts,
         }
-        self._dynamics = flag("dynamics", dynamics)
         self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
         self.arrays = one_of("arrays", arrays, ARRAYS)
         self._max_contacts = whole_number("max_contacts", max_contacts, at_most=1000)
@@ -109,8 +110,7 @@ class WarpBackend(Backend):
         self.overshoot = 0.01
         if max_joint_velocity is not None:
             self.joint_velocity = limited_velocity(robot, max_joint_velocity)
-        if self._dynamics:
-            robot.require_dynamics()
+        if self.dynamic:
             step_times(self.control_period, self._physics_step)
         else:
             # Limits in single precision may be this much beyond those of the robot.
@@ -141,7 +141,7 @@ class WarpBackend(Backend):
                 self.num_envs,
                 self._on,
                 control_period=self.control_period,
-                physics_step=self._physics_step if self._dynamics else None,
+                physics_step=self._physics_step if self.dynamic else None,
                 servo_gain=self._servo_gain,
                 joint_velocity=self.joint_velocity,
                 teleports=self.teleports,
@@ -235,12 +235,12 @@ class WarpBackend(Backend):
         """The state in the arrays of the engine."""
         engine = self._engine
         read: Callable[[Any], Any] = self._read_tensor if self.arrays == "torch" else _read_numbers
-        truncates = self._dynamics and self.on_divergence == "truncate"
+        truncates = self.dynamic and self.on_divergence == "truncate"
         common: dict[str, Any] = {
             "q": read(engine.q),
             "qd": read(engine.qd),
             "collided": read(engine.collided),
-            "torque": read(engine.torque) if self._dynamics else None,
+            "torque": read(engine.torque) if self.dynamic else None,
             "diverged": read(engine.diverged) if truncates else None,
         }
         if self.arrays == "torch":

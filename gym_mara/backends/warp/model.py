@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from gym_mara.backends.mujoco.model import build_model, link_of_geoms
+from gym_mara.backends.mujoco.model import build_model, link_of_geoms, link_pairs
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
@@ -58,7 +58,7 @@ def pairs_of_geoms(
     robot: RobotModel, model: mujoco.MjModel
 ) -> tuple[list[tuple[str, str]], NDArray[np.int32]]:
     """The pairs of links that may collide, and the number of the pair of each two shapes (G, G), -1 for no pair."""
-    pairs = sorted((min(pair), max(pair)) for pair in robot.collision_pairs)
+    pairs = link_pairs(robot)
     number = {pair: index for index, pair in enumerate(pairs)}
     links = link_of_geoms(robot, model)
     table = [[number.get((min(a, b), max(a, b)), -1) for a in links] for b in links]
