@@ -30,7 +30,7 @@ class Backend(ABC):
     most_arms: ClassVar[int] = 2**20
     """The largest number of arms: with more, an ordinary machine runs out of memory."""
     precision: ClassVar[type[np.floating[Any]]] = np.float64
-    """The floating-point type in which the engine computes; states are in double precision all the same."""
+    """The floating-point type in which the engine computes; NumPy's arrays are in double precision all the same."""
     teleports: bool = False
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False

@@ -169,13 +169,13 @@ class WarpBackend(Backend):
         return self._engine.bytes_per_arm
 
     def asarray(self, values: ArrayLike) -> Any:
-        array = np.asarray(values)
-        if self.arrays == "torch":
-            import torch
+        array = super().asarray(values)
+        if self.arrays == "numpy":
+            return array
+        import torch
 
-            dtype = torch.bool if array.dtype == np.bool_ else torch.float32
-            return torch.as_tensor(array, dtype=dtype, device=self.device)
-        return array if array.dtype == np.bool_ else array.astype(np.float64, copy=False)
+        dtype = torch.bool if array.dtype == np.bool_ else torch.float32
+        return torch.tensor(array, dtype=dtype, device=self.device)
 
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         engine = self._engine

@@ -85,13 +85,14 @@ def capturing(device: wp.Device) -> Iterator[wp.ScopedCapture]:
 @contextmanager
 def compiling() -> Iterator[None]:
     """Print one line if kernels are compiled, not if they come from the cache, and nothing else of Warp's messages."""
+    before = wp.get_logger(), wp.config.log_level
     wp.set_logger(_CompileLogger())
     wp.config.log_level = wp.LOG_INFO
     try:
         yield
     finally:
-        wp.config.log_level = wp.LOG_WARNING
-        wp.set_logger(None)
+        wp.set_logger(before[0])
+        wp.config.log_level = before[1]
 
 
 class _CompileLogger:

@@ -74,11 +74,11 @@ class Engine:
         self.bytes_per_arm = bytes_per_arm(model, rows, max_contacts)
         check_memory(device, num_envs, self.bytes_per_arm)
         try:
-            self._model = mjw.put_model(model)
+            self.model = mjw.put_model(model)
         except (NotImplementedError, ValueError) as error:
             raise GymMaraError(f"MuJoCo Warp cannot simulate {robot.name}: {error}") from error
-        self._model.opt.warn_overflow = 0  # it prints a line in each step
-        self._model.opt.graph_conditional = device.is_cpu or wp.is_conditional_graph_supported()
+        self.model.opt.warn_overflow = 0  # it prints a line in each step
+        self.model.opt.graph_conditional = device.is_cpu or wp.is_conditional_graph_supported()
         self.data = mjw.make_data(model, num_envs, **room)
         self.pairs, pair_of = pairs_of_geoms(robot, model)
         self._pair_of = wp.array(pair_of, dtype=int)
@@ -178,14 +178,15 @@ class Engine:
             self._report()
             return
         for number in range(self._steps if steps is None else steps):
-            mjw.step1(self._model, data)
+            mjw.step1(self.model, data)
             self._count_contacts()
             self._command(number * self._physics_step)
-            mjw.step2(self._model, data)
+            mjw.step2(self.model, data)
         rows = [data.efc.type, data.efc.id, data.nefc, data.efc.force, self.torque]
         wp.launch(kernels.read_torque, (self._num, self._rows), rows)
-        judged = [*now, self.torque, *contacts, self.steps, self.diverged, self._status]
-        self._over_arms(kernels.judge, [self._velocity, *before, *judged])
+        judged = [*now, self.torque, *contacts, self.steps, self.diverged]
+        told = [data.overflow, self._status]
+        self._over_arms(kernels.judge, [self._velocity, *before, *judged, *told])
         self._look_at_arms()
 
     def _command(self, time: float) -> None:
@@ -222,8 +223,8 @@ class Engine:
         self._report()
 
     def _find_contacts(self) -> None:
-        mjw.kinematics(self._model, self.data)
-        mjw.collision(self._model, self.data)
+        mjw.kinematics(self.model, self.data)
+        mjw.collision(self.model, self.data)
         self._count_contacts()
 
     def _count_contacts(self) -> None:

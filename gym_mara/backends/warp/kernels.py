@@ -146,6 +146,7 @@ def judge(
     hit: wp.array[int],
     steps: wp.array[int],
     diverged: wp.array[wp.bool],
+    overflow: wp.array[int],
     status: wp.array[int],
 ):
     """End a control period with dynamics: put arms whose state diverged back to where they were before it."""
@@ -162,6 +163,7 @@ def judge(
         return
     wp.atomic_max(status, _DIVERGED, arm + 1)
     hit[arm] = 0
+    overflow[arm] = 0
     for pair in range(depth.shape[1]):
         depth[arm, pair] = _NO_CONTACT
     for joint in range(qpos.shape[1]):
