@@ -30,6 +30,9 @@ _HARD = (mujoco.mjMAXIMP, mujoco.mjMAXIMP, 1.0, 0.5, 1.0)
 _CONTACT_IMPEDANCE = (0.999, mujoco.mjMAXIMP, 0.001, 0.5, 2.0)
 _CONTACT_DAMPING = 40.0
 
+_THIN = 5e-5
+"""Half the thickness of what is flat, m."""
+
 
 def build_model(robot: RobotModel, physics_step: float, *, shafts: bool = True) -> mujoco.MjModel:
     """MuJoCo's model of a robot, with its motors, end stops, and the pairs of links that may collide.
@@ -240,7 +243,7 @@ def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape)
         case Mesh() as mesh:
             spec.add_mesh(
                 name=geometry.name,
-                uservert=mesh.hull.vertices.ravel(),
+                uservert=_with_volume(mesh.hull.vertices).ravel(),
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
             )
             options = {"type": kinds.mjGEOM_MESH, "meshname": geometry.name}
@@ -251,6 +254,15 @@ def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape)
         **options,
         **_placed(geometry.placement),
     )
+
+
+def _with_volume(vertices: Floats) -> Floats:
+    """The vertices (V, 3), m, of a shape; where it is flat, of one a little thicker, because MuJoCo needs a volume."""
+    _, lengths, directions = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)
+    for length, direction in zip(lengths, directions, strict=True):
+        if length <= 1e-9 * lengths[0]:
+            vertices = np.concatenate([vertices - _THIN * direction, vertices + _THIN * direction])
+    return vertices
 
 
 def _add_body(parent: Any, inertia: pin.Inertia, **options: Any) -> Any:
