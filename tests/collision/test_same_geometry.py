@@ -1,4 +1,4 @@
-"""Every engine has the same geometry of meshes: Coal, python-fcl and DART agree wherever Coal sees no contact nearby."""
+"""Every engine has the same geometry of meshes: Coal, python-fcl, DART and MuJoCo agree wherever Coal sees no contact nearby."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from gym_mara.backends.dart.arm import DartArm
+from gym_mara.backends.mujoco.backend import MujocoBackend
 from gym_mara.collision import make_checker
 from gym_mara.rendering.scene import Scene
 from gym_mara.robot import RobotModel
@@ -19,7 +20,7 @@ from tests.helpers import Floats, Mask, write
 from tests.robot.description.meshes.test_reader import TWO_PARTS, dae
 from tests.shape_pairs import PRIMITIVES, held, wrong
 
-ENGINES = ("fcl", "dart with fcl", "dart with dart")
+ENGINES = ("fcl", "dart with fcl", "dart with dart", "mujoco")
 MESHES = {
     "concave": '<mesh filename="concave.stl"/>',
     "two parts": '<mesh filename="parts.obj" scale="0.3 0.35 0.2"/>',
@@ -42,6 +43,10 @@ def folder(tmp_path: Path) -> Path:
 
 def _check(engine: str, robot: RobotModel, q: Floats) -> Mask:
     name, _, detector = engine.partition(" with ")
+    if name == "mujoco":
+        backend = MujocoBackend(robot, len(q))
+        backend.reset(q)
+        return backend.state.collided
     if name != "dart":
         return make_checker(name, robot).check(q)
     arm, found = DartArm(robot, detector=detector), []

@@ -13,11 +13,18 @@ from gym_mara.backends.mujoco.contacts import ContactFinder
 from gym_mara.backends.mujoco.model import SHAFT_INERTIA, build_model, set_parameters
 from gym_mara.backends.mujoco.threads import Stepper, choose_threads
 from gym_mara.backends.servo import Motion, ServoBackend
+from gym_mara.errors import GymMaraError
+from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact
 from gym_mara.types import Floats
 
+with needs("the backend 'mujoco'", "mujoco"):
+    import mujoco
+
+MOST_MEMORY = 2**33
+"""The most memory for the arms, bytes."""
 _OF_ENGINE = frozenset(("mass", "effort_limit", "joint_friction", "contact_friction"))
 """The parameters that the engine needs to know; the servos and the sensors take care of the others."""
 
@@ -45,7 +52,9 @@ class MujocoBackend(ServoBackend):
         GymMaraError: a setting is out of its range, or MuJoCo cannot load the robot.
     """
 
-    most_arms = 2**16  # with random parameters each has a model, of 35 kB for MARA
+    most_arms = (
+        2**16
+    )  # with random parameters each has a model, of 35 kB for MARA and more with meshes
 
     def __init__(
         self,
@@ -72,42 +81,47 @@ class MujocoBackend(ServoBackend):
         )
         self._settings["threads"] = threads
         self._model = build_model(robot, self.physics_step)
+        own_models = bool(_OF_ENGINE & self.randomisation.ranges.keys())
+        _check_memory(num_envs, self._model, len(self._times), own_models)
         self._stepper = Stepper(self._model, choose_threads(num_envs, threads))
         self._contact_finder = ContactFinder(robot)
         self._models = [self._model] * num_envs
-        if _OF_ENGINE & self.randomisation.ranges.keys():
+        if own_models:
             self._models = [copy.copy(self._model) for _ in range(num_envs)]
         # MuJoCo's state: time, positions, velocities. Joints come first, the motors' shafts last.
         joints, nq, nv = robot.num_joints, self._model.nq, self._model.nv
         self._joint_q, self._joint_v = slice(1, 1 + joints), slice(1 + nq, 1 + nq + joints)
         self._shaft_q, self._shaft_v = slice(1 + nq - joints, 1 + nq), slice(-joints, None)
         self._v = slice(1 + nq, None)
+        followers = [self._model.joint(each.name) for each in robot.followers]
+        self._follower_q = [1 + each.qposadr.item() for each in followers]
+        self._follower_v = [1 + nq + each.dofadr.item() for each in followers]
         self._states = np.zeros((num_envs, 1 + nq + nv))
         self._warmstarts = np.zeros((num_envs, nv))
+        self._controls = np.empty((num_envs, len(self._times), joints))
+        self._whole_time = (len(self._times) - 0.5) * self.physics_step
         self.reset(np.tile(robot.home, (num_envs, 1)))
 
     def _run(self, velocities: Floats) -> Motion:
+        controls, states = self._controls, self._states
         # Contacts are found at the beginning of a step, so one more shows those at the end of the period.
-        commands = np.concatenate([velocities, velocities[-1:]]).swapaxes(0, 1)
-        states = self._states
+        controls[:, :-1], controls[:, -1] = velocities.swapaxes(0, 1), velocities[-1]
         states[:, 0], states[:, self._shaft_q], states[:, self._shaft_v] = 0.0, 0.0, velocities[0]
-        path, distances = self._stepper.run(
-            self._models, states, self._warmstarts, np.ascontiguousarray(commands)
-        )
-        before = np.concatenate([states[:, None, self._joint_q], path[:, :-1, self._joint_q]], 1)
-        end, next_ = path[:, -2].copy(), path[:, -1]
-        self._warmstarts = (next_[:, self._v] - end[:, self._v]) / self.physics_step
+        path, distances = self._stepper.run(self._models, states, self._warmstarts, controls)
+        end, beyond = path[:, -2].copy(), path[:, -1]
+        contacts = self._contact_finder.find(distances, lambda: self._q_of(states, path))
         self._states = end
+        self._warmstarts = (beyond[:, self._v] - end[:, self._v]) / self.physics_step
         qd = end[:, self._joint_v].copy()
-        stopped = next_[:, 0] < (len(velocities) + 0.5) * self.physics_step
-        qd[stopped] = np.nan
-        slip = velocities[-1] - end[:, self._shaft_v]
-        return Motion(
-            q=end[:, self._joint_q].copy(),
-            qd=qd,
-            torque=SHAFT_INERTIA / self.physics_step * slip,
-            contacts=self._contact_finder.find(before, distances),
-        )
+        stopped = beyond[:, 0] < self._whole_time
+        if np.count_nonzero(stopped):
+            qd[stopped] = np.nan
+        torque = (velocities[-1] - end[:, self._shaft_v]) * (SHAFT_INERTIA / self.physics_step)
+        return Motion(end[:, self._joint_q].copy(), qd, torque, contacts)
+
+    def _q_of(self, states: Floats, path: Floats) -> Floats:
+        """The joint positions at the beginning of each step (N, K, J)."""
+        return np.concatenate([states[:, None], path[:, :-1]], axis=1)[..., self._joint_q]
 
     def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
         for arm, row in zip(arms.tolist(), q, strict=True):
@@ -115,7 +129,7 @@ class MujocoBackend(ServoBackend):
         models = [self._models[arm] for arm in arms.tolist()]
         none = np.zeros((len(arms), 1, self.robot.num_joints))
         _, distances = self._stepper.run(models, self._states[arms], self._warmstarts[arms], none)
-        return self._contact_finder.find(q[:, None], distances)
+        return self._contact_finder.find(distances, lambda: q[:, None])
 
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         self._set_state(arm, q, qd)
@@ -123,10 +137,9 @@ class MujocoBackend(ServoBackend):
     def _set_state(self, arm: int, q: Floats, qd: Floats) -> None:
         followers, state = self.robot.followers, self._states[arm]
         state[:] = 0.0
-        after = slice(self._joint_q.stop, self._joint_q.stop + len(followers))
-        state[self._joint_q], state[after] = q, [each.position(q) for each in followers]
-        after = slice(self._joint_v.stop, self._joint_v.stop + len(followers))
-        state[self._joint_v], state[after] = qd, [each.velocity(qd) for each in followers]
+        state[self._joint_q], state[self._joint_v] = q, qd
+        state[self._follower_q] = [each.position(q) for each in followers]
+        state[self._follower_v] = [each.velocity(qd) for each in followers]
         self._warmstarts[arm] = 0.0
 
     def _set_parameters(self, arm: int, parameters: Mapping[str, Floats]) -> None:
@@ -147,3 +160,14 @@ class MujocoBackend(ServoBackend):
 
     def close(self) -> None:
         self._stepper.stop()
+
+
+def _check_memory(num_envs: int, model: mujoco.MjModel, steps: int, own_models: bool) -> None:
+    """Check that N arms do not take too much memory: the states of a control period, and models of their own."""
+    numbers = 1 + model.nq + model.nv + model.nsensordata + model.nu
+    size = 8 * steps * numbers + own_models * mujoco.mj_sizeModel(model)
+    if num_envs * size > MOST_MEMORY:
+        raise GymMaraError(
+            f"num_envs must be at most {MOST_MEMORY // size}, because each arm takes {size / 1e6:.2g} MB with {steps - 1} "
+            f"physics steps in a control period{' and random parameters' if own_models else ''}; not {num_envs}"
+        )

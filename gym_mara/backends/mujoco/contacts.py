@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 
@@ -40,17 +42,19 @@ class ContactFinder:
             if numbers[one, other] in self._to_check:
                 self._to_check[numbers[one, other]].append(index)
 
-    def find(self, q: Floats, distances: Floats) -> list[tuple[Contact, ...]]:
+    def find(self, distances: Floats, q: Callable[[], Floats]) -> list[tuple[Contact, ...]]:
         """The contacts of N arms, each with the pair's largest depth.
 
         Args:
-            q: joint positions in each physics step (N, K, J), rad.
-            distances: of each of `link_pairs` (N, K, P), m; negative in contact.
+            distances: of each of `link_pairs` in each physics step (N, K, P), m; negative in contact, else 0.
+            q: gives the joint positions in each physics step (N, K, J), rad.
         """
-        if self._to_check and np.count_nonzero(distances):
-            distances = self._of_meshes(q, distances)
+        contacts: list[tuple[Contact, ...]] = [()] * len(distances)
+        if not np.count_nonzero(distances):
+            return contacts
+        if self._to_check:
+            distances = self._of_meshes(q(), distances)
         nearest = distances.min(axis=1)
-        contacts: list[tuple[Contact, ...]] = [()] * len(q)
         touching = nearest < 0.0
         for arm in np.flatnonzero(touching.any(axis=1)).tolist():
             contacts[arm] = tuple(
