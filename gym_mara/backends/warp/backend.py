@@ -138,6 +138,8 @@ class WarpBackend(Backend):
         }
         self._kinematics = robot.kinematics()
         self._engine = self._new_engine(device)
+        self._views: dict[int, torch.Tensor] = {}
+        """Tensors that share the memory of arrays of the engine, by address."""
         self._fresh = False
         """Whether the arrays of the engine are those of the current state."""
         self._told_of_contacts = False
@@ -310,8 +312,9 @@ class WarpBackend(Backend):
         """A copy of an array of the engine, on the device."""
         import warp as wp
 
-        tensor: torch.Tensor = wp.to_torch(array)
-        return tensor.clone()
+        if array.ptr not in self._views:
+            self._views[array.ptr] = wp.to_torch(array)
+        return self._views[array.ptr].clone()
 
     def _contacts(self, collided: Mask) -> tuple[tuple[Contact, ...], ...]:
         """The contacts of each arm in the last control period."""
@@ -334,9 +337,9 @@ class WarpBackend(Backend):
         status = self._engine.status.numpy()
         if not np.count_nonzero(status):
             return
-        diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         with self._scope():
-            self._engine.clear_status()
+            status = self._engine.take_status()
+        diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         if lost:
             raise GymMaraError(
                 f"{self.num_envs} arms have more contacts than max_contacts={self._max_contacts} for each has room for, and "

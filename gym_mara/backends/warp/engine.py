@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from gym_mara.backends.warp.device import bytes_per_arm, capturing, check_memory, compiling
 from gym_mara.backends.warp.model import pairs_of_geoms, warp_model
@@ -260,10 +261,13 @@ class Engine:
         self._over_arms(kernels.report, arguments)
         wp.copy(self.status, self._status)
 
-    def clear_status(self) -> None:
-        """Forget what `status` has told."""
+    def take_status(self) -> NDArray[np.int32]:
+        """Wait for the device, and return what `status` tells then, which is forgotten."""
+        wp.synchronize_device()
+        status: NDArray[np.int32] = self.status.numpy().copy()
         self._status.zero_()
         self.status.zero_()
+        return status
 
     def _over_arms(self, kernel: Any, arguments: list[Any]) -> None:
         wp.launch(kernel, self._num, arguments)
