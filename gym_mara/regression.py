@@ -32,6 +32,7 @@ MOST_STATES = 100_000
 _HEADER = "# gym_mara reward record: "
 _LARGEST = 2**26
 """Of a record, bytes."""
+_OF_MACHINE = {"workers", "threads"}
 _BLOCK = 256
 """How many states are computed at a time."""
 
@@ -260,7 +261,7 @@ def _check_tolerance(tolerance: float) -> None:
 
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
     """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
-    known = {*ROBOT_KEYWORDS, *task_keywords(env), *backend_settings(backend)} - {"workers"}
+    known = {*ROBOT_KEYWORDS, *task_keywords(env), *backend_settings(backend)} - _OF_MACHINE
     for name in options:
         if name not in known:
             raise unknown("keyword argument", name, known, " of a reward record")

@@ -11,12 +11,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from gym_mara import cli
+from gym_mara.backends import backend_names
 from gym_mara.robot import RobotModel
 
 Floats = NDArray[np.float64]
@@ -29,6 +31,13 @@ TARGET_Q = (-0.237, -0.5528, 0.8681, 0.0, 1.7207, -0.237)
 PATH_ENDS = ((0.5, -1.9, -0.3, -2.4, 1.1, -2.6), (0.5, -1.9, -0.3, 2.4, 1.1, -2.6))
 """Two collision-free configurations of MARA. On the way, with motor4 between about -1.15 and 1.06 rad, the tool
 collides with the arm."""
+
+WITHOUT_GPU: dict[str, dict[str, Any]] = {"warp": {"device": "cpu"}}
+"""The settings that a backend needs on a machine without a GPU, by its name. It is slow there."""
+EVERY_BACKEND = [
+    pytest.param(name, marks=pytest.mark.slow if name in WITHOUT_GPU else ())
+    for name in backend_names()
+]
 
 MODULAR_ARMS: dict[int, list[str]] = {
     3: ["base", "motor_large", "motor_medium", "tool"],

@@ -15,6 +15,7 @@ import pytest
 from gym_mara import cli
 from gym_mara.cli import app
 from tests.helpers import started
+from tests.robot.arms import TOOL, arm, arm_file
 
 GYM_MARA = ["-m", "gym_mara.cli"]
 
@@ -25,6 +26,15 @@ def _done(*arguments: str, **options: object) -> subprocess.CompletedProcess[str
         [sys.executable, *GYM_MARA, *arguments],
         **{"check": False, "text": True, "timeout": 120, "stderr": subprocess.PIPE, **options},
     )
+
+
+def test_a_warning_is_one_line_without_a_place_in_the_code(tmp_path: Path) -> None:
+    urdf = arm_file(tmp_path, arm(base="", collision=""))  # it never collides
+    options = ["--set", f"robot={urdf}", "--set", f"ee_frame={TOOL}", "--states", "2"]
+    done = _done("rewards", "--record", str(tmp_path / "new.csv"), *options)
+    assert done.returncode == 0
+    assert done.stderr.startswith("warning: ")
+    assert ".py" not in done.stderr
 
 
 @pytest.mark.parametrize(

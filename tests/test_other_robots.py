@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv
 from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import TASKS
-from tests.helpers import MODULAR_ARMS, robot_model
+from tests.helpers import EVERY_BACKEND, MODULAR_ARMS, WITHOUT_GPU
 
 ARMS: dict[str, RobotLike] = {
     **{name: name for name in ("ur5", "ur10", "panda", "so100", "talos_arm")},
@@ -17,11 +16,12 @@ ARMS: dict[str, RobotLike] = {
 }
 
 
-@pytest.mark.parametrize("backend", backend_names())
+@pytest.mark.parametrize("backend", EVERY_BACKEND)
 @pytest.mark.parametrize("arm", ARMS)
 def test_an_arm_runs_every_task_and_can_be_drawn(arm: str, backend: str) -> None:
     rng, source = np.random.default_rng(0), ARMS[arm]
-    robot = robot_model(source) if isinstance(source, str) else RobotModel.load(source)
+    hulls = backend == "warp"  # which knows only convex shapes
+    robot = RobotModel.load(source, convex_hulls=hulls)
     for task in TASKS:
         draws = task == "MARACollisionOrient-v0"
         env = MaraEnv(
@@ -32,6 +32,7 @@ def test_an_arm_runs_every_task_and_can_be_drawn(arm: str, backend: str) -> None
             renderer="raycast",
             width=160,
             height=120,
+            **WITHOUT_GPU.get(backend, {}),
         )
         env.reset(seed=0)
         for _ in range(5):

@@ -63,6 +63,14 @@ class Backend(ABC):
         )
         self.joint_velocity = robot.velocity_limit
 
+    @classmethod  # noqa: B027 - most need nothing special
+    def require_machine(cls) -> None:
+        """Check that this machine has what the engine needs unless its settings say otherwise, such as a GPU.
+
+        Raises:
+            GymMaraError: it has not.
+        """
+
     def asarray(self, values: ArrayLike) -> Array:
         """Values of the host as an array for this backend: flags stay flags, numbers become its floats.
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -20,7 +21,7 @@ INTERRUPTED = 130
 
 def main() -> None:
     """Run the command, and end the process with 0, 1 (a check found a difference), 2 (an error) or 130 (interrupted)."""
-    with _terminated_like_interrupted():
+    with _terminated_like_interrupted(), _plain_warnings():
         code = _run()
         try:
             if sys.stdout is not None:  # it is None if it was closed before the start
@@ -70,6 +71,17 @@ def _output_failed(error: OSError) -> int:
     if isinstance(error, BrokenPipeError):
         return FAILED
     return _failed(f"error: cannot write the output: {error.strerror or error}")
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print a warning as one line, without its place in the code."""
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecVideoRecorder
 
 from gym_mara.agents.runs.evaluation import make_env
-from gym_mara.backends import backend_names
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, MissingExtraError
@@ -25,7 +24,7 @@ from gym_mara.rendering import CAMERAS, RENDERERS, RenderSettings
 from gym_mara.rendering.camera import VIEW_ANGLE, place_camera
 from gym_mara.rendering.scene import Scene
 from gym_mara.testing import COLLIDING_Q
-from tests.helpers import TARGET_Q
+from tests.helpers import EVERY_BACKEND, TARGET_Q, WITHOUT_GPU
 
 Picture = NDArray[np.uint8]
 
@@ -88,9 +87,10 @@ def test_a_picture_is_a_fresh_array_of_the_requested_size(renderer: str) -> None
     env.close()
 
 
-@pytest.mark.parametrize("backend", backend_names())
+@pytest.mark.parametrize("backend", EVERY_BACKEND)
 def test_colliding_links_are_red_until_the_next_step(renderer: str, backend: str) -> None:
-    env = MaraEnv(render_mode="rgb_array", backend=backend, renderer=renderer, **SMALL)
+    options = SMALL | WITHOUT_GPU.get(backend, {})
+    env = MaraEnv(render_mode="rgb_array", backend=backend, renderer=renderer, **options)
     env.reset(seed=0)
     counts, hits = [], []
     for step in range(90):

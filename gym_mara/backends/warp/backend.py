@@ -146,6 +146,12 @@ class WarpBackend(Backend):
         self._apply_parameters(range(num_envs))
         self.reset(self.asarray(np.tile(robot.home, (num_envs, 1))))
 
+    @classmethod
+    def require_machine(cls) -> None:
+        from gym_mara.backends.warp.device import choose_device
+
+        choose_device(None)
+
     def _new_engine(self, device: str | None) -> Engine:
         with needs("the backend 'warp'", "warp"):
             from gym_mara.backends.warp.device import choose_device
