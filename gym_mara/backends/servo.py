@@ -117,18 +117,10 @@ class ServoBackend(Backend):
             for name, value in self.randomisation.nominal().items()
         }
         # The latest targets (N, D, J), the newest last: as many as the longest latency needs.
-        self._targets = np.stack([self._q] * (self._late_periods() + 2), axis=1)
+        self._targets = np.stack(
+            [self._q] * (late_periods(self.randomisation, control_period) + 2), axis=1
+        )
         self._latency = np.zeros((num_envs, 1))
-
-    def _late_periods(self) -> int:
-        """The number of whole control periods in the longest latency."""
-        longest = self.randomisation.ranges.get("latency", (0.0, 0.0))[1]
-        if longest / self.control_period > MOST_LATE_PERIODS:
-            raise GymMaraError(
-                f"the latency must be at most {MOST_LATE_PERIODS} control periods of {self.control_period:g} s, because "
-                f"the targets of that time are kept; not {longest:g} s"
-            )
-        return int(longest // self.control_period)
 
     @abstractmethod
     def _run(self, velocities: Floats) -> Motion:
@@ -237,6 +229,21 @@ class ServoBackend(Backend):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return made_again, (type(self), self.robot, self.num_envs, self._settings, self.save())
+
+
+def late_periods(randomisation: Randomisation, control_period: float) -> int:
+    """The number of whole control periods in the longest latency.
+
+    Raises:
+        GymMaraError: it is more than MOST_LATE_PERIODS.
+    """
+    longest = randomisation.ranges.get("latency", (0.0, 0.0))[1]
+    if longest / control_period > MOST_LATE_PERIODS:
+        raise GymMaraError(
+            f"the latency must be at most {MOST_LATE_PERIODS} control periods of {control_period:g} s, because the targets "
+            f"of that time are kept; not {longest:g} s"
+        )
+    return int(longest // control_period)
 
 
 def simulation_diverged(arm: int, time: float) -> SimulationDivergedError:

@@ -65,6 +65,7 @@ CASES = {
     "warp": Case("warp", WARP),
     "warp, kinematic": Case("warp", WARP | {"dynamics": False}),
     "warp, travelling": Case("warp", WARP | TRAVELLING | {"dynamics": False}),
+    "warp, random": Case("warp", WARP | {"randomisation": RANDOM, "on_divergence": "truncate"}),
     "warp, rail": Case("warp", WARP, "rail"),
     "pinocchio, travelling": Case("pinocchio", TRAVELLING),
     "pinocchio, fcl": Case("pinocchio", {"collision": "fcl"}),

@@ -101,6 +101,41 @@ def test_it_moves_as_mujoco_does_and_holds_the_arm_with_the_same_torques(mara: R
     np.testing.assert_allclose(mine.torque[0], gravity, rtol=0.0, atol=0.1)
 
 
+RANDOM = {
+    "mass": (0.7, 1.5),
+    "effort_limit": (0.02, 1.0),
+    "servo_gain": (5.0, 15.0),
+    "joint_friction": (0.0, 5.0),
+    "contact_friction": (0.1, 1.0),
+    "latency": (0.0, 0.07),
+    "sensor_noise": (0.0, 1e-3),
+}
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_random_parameters_act_as_in_mujoco(mara: RobotModel, name: str) -> None:
+    settings: dict[str, Any] = {"randomisation": {name: RANDOM[name]}}
+    seeds, every = np.arange(4, dtype=np.uint64), np.ones(4, np.bool_)
+    # Where the arm slides over the table, small differences soon grow.
+    steps, start, target = 15, (0.0, 1.5, 0.0, 0.0, 0.0, 0.0), FREE_TARGET
+    if name == "contact_friction":
+        steps, start, target = 6, (1.5, 1.9, 0.0, 0.0, 0.0, 0.0), np.array([0.5, 2.0, 0, 0, 0, 0])
+    backends = _warp(mara, 4, **settings), make_backend("mujoco", mara, 4, settings)
+    paths = []
+    for backend in backends:
+        backend.begin_episodes(seeds, every)
+        backend.reset(np.tile(start, (4, 1)))
+        paths.append([backend.step(np.tile(target, (4, 1))) for _ in range(steps)])
+    for mine, theirs in zip(*paths, strict=True):
+        assert mine.parameters is not None
+        assert theirs.parameters is not None
+        np.testing.assert_array_equal(mine.parameters[name], theirs.parameters[name])
+        np.testing.assert_allclose(mine.q, theirs.q, rtol=0.0, atol=2e-3)
+        assert mine.torque is not None
+        assert theirs.torque is not None
+        np.testing.assert_allclose(mine.torque, theirs.torque, rtol=0.01, atol=0.3)
+
+
 @pytest.mark.parametrize("settings", [{}, {"max_joint_velocity": 1.0}], ids=str)
 def test_without_dynamics_it_moves_as_the_backend_pinocchio(
     mara: RobotModel, settings: dict[str, Any]
@@ -291,6 +326,8 @@ def test_without_a_gpu_the_error_names_the_cpu(
         {"servo_gain": 0.0},
         {"max_joint_velocity": -1.0},
         {"on_divergence": "ignore"},
+        {"randomisation": {"mass": (1.2, 0.8)}},
+        {"randomisation": {"latency": (0.0, 0.1)}, "dynamics": False},
     ],
     ids=str,
 )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.backends.base import Backend, limited_velocity
-from gym_mara.backends.servo import ON_DIVERGENCE, made_again, simulation_diverged
+from gym_mara.backends.randomisation import Randomisation
+from gym_mara.backends.servo import ON_DIVERGENCE, late_periods, made_again, simulation_diverged
 from gym_mara.backends.servo_motion import step_times
 from gym_mara.errors import (
     LARGEST,
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
     from gym_mara.backends.warp.engine import Engine
 
 ARRAYS = ("numpy", "torch")
+OF_MODEL = frozenset(("mass", "effort_limit", "joint_friction", "contact_friction"))
+"""The parameters that the model on the device has; the servos and the sensors have the others."""
 _UNLIMITED = 1.0
 """The velocity for the bounds of a joint without limit that teleports, rad/s (m/s)."""
 
@@ -63,7 +67,9 @@ class WarpBackend(Backend):
         arrays: "numpy", or "torch" for tensors on the device, whose values are never copied to the host. Contacts are not
             reported then, and on a GPU an error may come a few steps late.
         device: "cuda", "cuda:1" and so on; "cpu" for tests; None for the first GPU.
-        max_contacts: the room for contacts of each arm; a contact has several points. More of them exert no force.
+        max_contacts: the room for points of contact of each arm; more of them exert no force.
+        randomisation: name → (lowest, highest), drawn for each arm at the beginning of each episode; see
+            `gym_mara.backends.randomisation`.
 
     Raises:
         GymMaraError: a setting is out of its range, the device has too little memory, MuJoCo Warp cannot simulate the
@@ -88,6 +94,7 @@ class WarpBackend(Backend):
         arrays: str = "numpy",
         device: str | None = None,
         max_contacts: int = 24,
+        randomisation: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         self.dynamic = flag("dynamics", dynamics)
         super().__init__(robot, num_envs, control_period=control_period)
@@ -101,6 +108,7 @@ class WarpBackend(Backend):
             "arrays": arrays,
             "device": device,
             "max_contacts": max_contacts,
+            "randomisation": randomisation,
         }
         self.on_divergence = one_of("on_divergence", on_divergence, ON_DIVERGENCE)
         self.arrays = one_of("arrays", arrays, ARRAYS)
@@ -118,11 +126,24 @@ class WarpBackend(Backend):
             self.teleports = max_joint_velocity is None
             limit = self.joint_velocity
             self.joint_velocity = np.where(limit < LARGEST, limit, _UNLIMITED)
+        self.randomisation = Randomisation({} if randomisation is None else randomisation, robot)
+        self.random = bool(self.randomisation.ranges)
+        if self.random and not self.dynamic:
+            raise GymMaraError(
+                "randomisation is of arms with dynamics: leave it out, or give dynamics=True"
+            )
+        self._parameters = {
+            name: np.repeat(value[None], num_envs, axis=0)
+            for name, value in self.randomisation.nominal().items()
+        }
         self._kinematics = robot.kinematics()
         self._engine = self._new_engine(device)
+        self._views: dict[int, torch.Tensor] = {}
+        """Tensors that share the memory of arrays of the engine, by address."""
         self._fresh = False
         """Whether the arrays of the engine are those of the current state."""
         self._told_of_contacts = False
+        self._apply_parameters(range(num_envs))
         self.reset(self.asarray(np.tile(robot.home, (num_envs, 1))))
 
     @classmethod
@@ -148,11 +169,12 @@ class WarpBackend(Backend):
                 self._on,
                 control_period=self.control_period,
                 physics_step=self._physics_step if self.dynamic else None,
-                servo_gain=self._servo_gain,
+                late_periods=late_periods(self.randomisation, self.control_period),
                 joint_velocity=self.joint_velocity,
                 teleports=self.teleports,
                 max_contacts=self._max_contacts,
                 by_pair=self.arrays == "numpy",
+                own_parameters=not OF_MODEL.isdisjoint(self.randomisation.ranges),
             )
 
     @contextmanager
@@ -182,6 +204,30 @@ class WarpBackend(Backend):
 
         dtype = torch.bool if array.dtype == np.bool_ else torch.float32
         return torch.tensor(array, dtype=dtype, device=self.device)
+
+    def begin_episodes(self, seeds: NDArray[np.uint64], mask: Mask) -> None:
+        arms = np.flatnonzero(mask).tolist()
+        for arm in arms:
+            for name, value in self.randomisation.draw(int(seeds[arm])).items():
+                self._parameters[name][arm] = value
+        self._apply_parameters(arms)
+
+    def _apply_parameters(self, arms: Iterable[int]) -> None:
+        """Copy the random parameters to the device, after those of these arms have changed."""
+        own, engine = self._parameters, self._engine
+        ones = np.ones((self.num_envs, self.robot.num_joints))
+        latency = own.get("latency", np.zeros(self.num_envs))
+        late = latency // self.control_period
+        with self._scope():
+            engine.gain.assign(self._servo_gain * own.get("servo_gain", ones))
+            engine.late.assign(late.astype(np.int32))
+            engine.change.assign(latency - late * self.control_period)
+            if engine.parameters is None:
+                return
+            of_model = OF_MODEL & own.keys()
+            for arm in arms:
+                engine.parameters.set(arm, {name: own[name][arm] for name in of_model})
+            engine.parameters.copy_to(engine.model)
 
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         engine = self._engine
@@ -248,6 +294,7 @@ class WarpBackend(Backend):
             "collided": read(engine.collided),
             "torque": read(engine.torque) if self.dynamic else None,
             "diverged": read(engine.diverged) if truncates else None,
+            "parameters": {n: self.asarray(v.copy()) for n, v in self._parameters.items()} or None,
         }
         if self.arrays == "torch":
             return SimState(
@@ -271,8 +318,9 @@ class WarpBackend(Backend):
         """A copy of an array of the engine, on the device."""
         import warp as wp
 
-        tensor: torch.Tensor = wp.to_torch(array)
-        return tensor.clone()
+        if array.ptr not in self._views:
+            self._views[array.ptr] = wp.to_torch(array)
+        return self._views[array.ptr].clone()
 
     def _contacts(self, collided: Mask) -> tuple[tuple[Contact, ...], ...]:
         """The contacts of each arm in the last control period."""
@@ -295,9 +343,9 @@ class WarpBackend(Backend):
         status = self._engine.status.numpy()
         if not np.count_nonzero(status):
             return
-        diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         with self._scope():
-            self._engine.clear_status()
+            status = self._engine.take_status()
+        diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         if lost:
             raise GymMaraError(
                 f"{self.num_envs} arms have more contacts than max_contacts={self._max_contacts} for each has room for, and "
@@ -315,13 +363,16 @@ class WarpBackend(Backend):
             raise simulation_diverged(diverged - 1, time)
 
     def save(self) -> dict[str, Any]:
-        return {name: array.numpy().copy() for name, array in self._engine.state.items()}
+        engine = {name: array.numpy().copy() for name, array in self._engine.state.items()}
+        return engine | {"parameters": copy.deepcopy(self._parameters)}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         check_fits("backend", snapshot, self.save())
         with self._scope():
             for name, array in self._engine.state.items():
                 array.assign(snapshot[name])
+        self._parameters = copy.deepcopy(snapshot["parameters"])
+        self._apply_parameters(range(self.num_envs))
         self._fresh = False
 
     def __reduce__(self) -> tuple[Any, ...]:

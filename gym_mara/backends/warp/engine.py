@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from gym_mara.backends.warp.device import bytes_per_arm, capturing, check_memory, compiling
 from gym_mara.backends.warp.model import pairs_of_geoms, warp_model
+from gym_mara.backends.warp.parameters import ModelParameters
 from gym_mara.errors import LARGEST, GymMaraError
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
@@ -38,11 +40,12 @@ class Engine:
         device: Warp's device.
         control_period: s.
         physics_step: s; None for arms without dynamics.
-        servo_gain: 1/s.
+        late_periods: the longest latency of a target, whole control periods.
         joint_velocity: the highest (J,), rad/s (m/s).
         teleports: whether arms without dynamics reach their targets at once.
         max_contacts: the room for contacts of each arm.
         by_pair: whether contacts are noted for each pair of links.
+        own_parameters: whether each arm has physical parameters of its own.
 
     Raises:
         GymMaraError: MuJoCo Warp cannot simulate the robot, or the device has too little memory.
@@ -56,25 +59,28 @@ class Engine:
         *,
         control_period: float,
         physics_step: float | None,
-        servo_gain: float,
+        late_periods: int,
         joint_velocity: Floats,
         teleports: bool,
         max_contacts: int,
         by_pair: bool,
+        own_parameters: bool,
     ) -> None:
         self.robot, self.device, self._num = robot, device, num_envs
         self._dynamics = physics_step is not None
         self._physics_step = control_period if physics_step is None else physics_step
         self._steps = round(control_period / self._physics_step)
-        self._period, self._gain = control_period, servo_gain
+        self._period = control_period
         model = warp_model(robot, self._physics_step)
         self._rows = model.neq + model.nv + model.ntendon
         rows = self._rows + model.njnt + _ROWS_OF_CONTACT * max_contacts
         room = {"njmax": rows, "naconmax": num_envs * max_contacts + _SPARE_CONTACTS}
         self.bytes_per_arm = bytes_per_arm(model, rows, max_contacts)
         check_memory(device, num_envs, self.bytes_per_arm)
+        self.parameters = ModelParameters(model, num_envs) if own_parameters else None
+        batch_sizes = self.parameters.batch_sizes if self.parameters else None
         try:
-            self.model = mjw.put_model(model)
+            self.model = mjw.put_model(model, batch_sizes)
         except (NotImplementedError, ValueError) as error:
             raise GymMaraError(f"MuJoCo Warp cannot simulate {robot.name}: {error}") from error
         self.model.opt.warn_overflow = 0  # it prints a line in each step
@@ -82,7 +88,8 @@ class Engine:
         self.data = mjw.make_data(model, num_envs, **room)
         self.pairs, pair_of = pairs_of_geoms(robot, model)
         self._pair_of = wp.array(pair_of, dtype=int)
-        self._make_arrays(joint_velocity, teleports, len(self.pairs) if by_pair else 0)
+        self._make_arrays(len(self.pairs) if by_pair else 0, late_periods + 2)
+        self._limit_motion(joint_velocity, teleports)
         self._place_end_effector(model)
         self._graphs: dict[str, wp.Graph] = {}
         with compiling():
@@ -90,9 +97,13 @@ class Engine:
             self._look_at_arms()
             self.put_at_rest()
 
-    def _make_arrays(self, joint_velocity: Floats, teleports: bool, pairs: int) -> None:
+    def _make_arrays(self, pairs: int, targets: int) -> None:
         """Allocate what MuJoCo Warp's data lack."""
-        robot, num, joints = self.robot, self._num, self.robot.num_joints
+        num, joints = self._num, self.robot.num_joints
+        self.gain, self.change = wp.ones((num, joints), dtype=float), _zeros(num)
+        self.late = _zeros(num, int)
+        """The servos' gains, 1/s. A target takes effect after so many whole periods, and this much of the next, s."""
+        self._targets = _zeros((num, targets, joints))
         self.target, self.mask = _zeros((num, joints)), _zeros(num, wp.bool)
         self.torque, self.diverged = _zeros((num, joints)), _zeros(num, wp.bool)
         self.depth, self.hit = _zeros((num, pairs)), _zeros(num, int)
@@ -108,20 +119,6 @@ class Engine:
         self.time, self._status = _zeros(num), _zeros(3, int)
         self.status = wp.zeros(3, dtype=int, device="cpu", pinned=self.device.is_cuda)
         """On the host; `kernels` names its entries. On a GPU it is that of the last step that has ended."""
-        self._velocity = wp.array(joint_velocity, dtype=float)
-        self._reach = wp.array(robot.reach, dtype=float)
-        furthest, self._most_samples = joint_velocity * self._period, 1
-        if teleports:
-            furthest = np.full(joints, LARGEST)
-        else:
-            self._most_samples = max(1, int(np.ceil(furthest @ robot.reach / PATH_RESOLUTION)))
-        self._furthest = wp.array(furthest, dtype=float)
-        leaders = [follower.leader for follower in robot.followers]
-        self._followers = [
-            wp.array(leaders, dtype=int),
-            wp.array([follower.multiplier for follower in robot.followers], dtype=float),
-            wp.array([follower.offset for follower in robot.followers], dtype=float),
-        ]
         data = self.data
         self.state = {
             "q": data.qpos,
@@ -134,8 +131,27 @@ class Engine:
             "touching": self._touching,
             "steps": self.steps,
             "diverged": self.diverged,
+            "targets": self._targets,
         }
         """All that the future depends on."""
+
+    def _limit_motion(self, joint_velocity: Floats, teleports: bool) -> None:
+        """Set how fast joints move, how far arms without dynamics travel in a period, and where followers belong."""
+        robot = self.robot
+        self._velocity = wp.array(joint_velocity, dtype=float)
+        self._reach = wp.array(robot.reach, dtype=float)
+        furthest, self._most_samples = joint_velocity * self._period, 1
+        if teleports:
+            furthest = np.full(robot.num_joints, LARGEST)
+        else:
+            self._most_samples = max(1, int(np.ceil(furthest @ robot.reach / PATH_RESOLUTION)))
+        self._furthest = wp.array(furthest, dtype=float)
+        leaders = [follower.leader for follower in robot.followers]
+        self._followers = [
+            wp.array(leaders, dtype=int),
+            wp.array([follower.multiplier for follower in robot.followers], dtype=float),
+            wp.array([follower.offset for follower in robot.followers], dtype=float),
+        ]
 
     def _place_end_effector(self, model: Any) -> None:
         frame = self.robot.model.frames[self.robot.ee_frame_id]
@@ -172,7 +188,8 @@ class Engine:
         before = [self._start_q, self._start_qd, self._start_warmstart]
         now = [data.qpos, data.qvel, data.qacc_warmstart]
         contacts = [self.depth, self.hit]
-        self._over_arms(kernels.begin, [*now, *before, *contacts, self._looking])
+        begun = [self.target, self._targets, *now, *before, *contacts, self._looking]
+        self._over_arms(kernels.begin, begun)
         if not self._dynamics:
             self._travel()
             self._report()
@@ -190,9 +207,10 @@ class Engine:
         self._look_at_arms()
 
     def _command(self, time: float) -> None:
-        data, limits = self.data, [self._gain, self._velocity, time, self._physics_step]
+        data = self.data
+        servo = [self._start_q, self._targets, self.late, self.change, self.gain, self._velocity]
         rows = [data.qvel, data.efc.type, data.efc.id, data.nefc, data.efc.aref]
-        arguments = [self._start_q, self.target, *limits, *rows]
+        arguments = [*servo, time, self._physics_step, *rows]
         wp.launch(kernels.command, (self._num, self._rows), arguments)
 
     def _travel(self) -> None:
@@ -214,7 +232,7 @@ class Engine:
         """Put the arms of `mask` at rest at `target`."""
         data = self.data
         moved = [data.qpos, data.qvel, data.qacc_warmstart, self.torque, self.depth, self.hit]
-        known = [self._looking, self._touching, self.steps, self.diverged]
+        known = [self._looking, self._touching, self.steps, self.diverged, self._targets]
         arguments = [self.mask, self.target, *self._followers, *moved, *known]
         self._over_arms(kernels.put_at_rest, arguments)
 
@@ -243,10 +261,13 @@ class Engine:
         self._over_arms(kernels.report, arguments)
         wp.copy(self.status, self._status)
 
-    def clear_status(self) -> None:
-        """Forget what `status` has told."""
+    def take_status(self) -> NDArray[np.int32]:
+        """Wait for the device, and return what `status` tells then, which is forgotten."""
+        wp.synchronize_device()
+        status: NDArray[np.int32] = self.status.numpy().copy()
         self._status.zero_()
         self.status.zero_()
+        return status
 
     def _over_arms(self, kernel: Any, arguments: list[Any]) -> None:
         wp.launch(kernel, self._num, arguments)

@@ -1,6 +1,6 @@
 """Warp's kernels around those of MuJoCo Warp: servos, paths, contacts, resets, and the report of a state.
 
-N is the number of arms, J that of the robot's joints, F that of the joints that follow others. Positions of MuJoCo's joints
+N is the number of arms, J that of the robot's joints, F that of the joints that follow others, D that of the latest targets. Positions of MuJoCo's joints
 (N, J + F) begin with those of the robot. All lengths are in m, angles in rad, times in s.
 """
 
@@ -39,8 +39,20 @@ def _servo_motion(way: float, gain: float, limit: float, time: float) -> float:
     return wp.sign(way) * (fast * limit - slow)
 
 
+@wp.func
+def _late_servo_motion(
+    q: float, old: float, new: float, gain: float, limit: float, time: float, change: float
+) -> float:
+    """`gym_mara.backends.servo_motion.late_servo_motion` for numbers."""
+    before = _servo_motion(old - q, gain, limit, wp.min(time, change))
+    after = wp.max(time - change, 0.0)
+    return before + _servo_motion(new - (q + before), gain, limit, after)
+
+
 @wp.kernel(enable_backward=False)
 def begin(
+    target: wp.array2d[float],
+    targets: wp.array3d[float],
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     warmstart: wp.array2d[float],
@@ -51,8 +63,13 @@ def begin(
     hit: wp.array[int],
     looking: wp.array[int],
 ):
-    """Begin a control period: keep the state before it, forget the contacts of the last one, look at all arms."""
+    """Begin a control period: keep the latest targets and the state before it, and forget the contacts of the last one."""
     arm = wp.tid()
+    newest = targets.shape[1] - 1
+    for joint in range(target.shape[1]):
+        for index in range(newest):
+            targets[arm, index, joint] = targets[arm, index + 1, joint]
+        targets[arm, newest, joint] = target[arm, joint]
     for joint in range(qpos.shape[1]):
         start_q[arm, joint] = qpos[arm, joint]
         start_qd[arm, joint] = qvel[arm, joint]
@@ -66,8 +83,10 @@ def begin(
 @wp.kernel(enable_backward=False)
 def command(
     start_q: wp.array2d[float],
-    target: wp.array2d[float],
-    gain: float,
+    targets: wp.array3d[float],
+    late: wp.array[int],
+    change: wp.array[float],
+    gain: wp.array2d[float],
     limit: wp.array[float],
     time: float,
     physics_step: float,
@@ -82,9 +101,11 @@ def command(
     if row >= nefc[arm] or efc_type[arm, row] != _FRICTION_TENDON:
         return
     joint = efc_id[arm, row]
-    way = target[arm, joint] - start_q[arm, joint]
-    now = _servo_motion(way, gain, limit[joint], time)
-    then = _servo_motion(way, gain, limit[joint], time + physics_step)
+    q, fastest, servo = start_q[arm, joint], limit[joint], gain[arm, joint]
+    newest = targets.shape[1] - 1 - late[arm]
+    old, new = targets[arm, newest - 1, joint], targets[arm, newest, joint]
+    now = _late_servo_motion(q, old, new, servo, fastest, time, change[arm])
+    then = _late_servo_motion(q, old, new, servo, fastest, time + physics_step, change[arm])
     velocity = (then - now) / physics_step
     aref[arm, row] = (velocity - qvel[arm, joint]) / physics_step
 
@@ -285,6 +306,7 @@ def put_at_rest(
     touching: wp.array[int],
     steps: wp.array[int],
     diverged: wp.array[wp.bool],
+    targets: wp.array3d[float],
 ):
     """Put the arms of a mask at rest at q (N, J), to be looked at."""
     arm = wp.tid()
@@ -293,6 +315,8 @@ def put_at_rest(
     for joint in range(q.shape[1]):
         qpos[arm, joint] = q[arm, joint]
         torque[arm, joint] = 0.0
+        for index in range(targets.shape[1]):
+            targets[arm, index, joint] = q[arm, joint]
     _place(qpos, arm, q.shape[1], leader, multiplier, offset)
     for joint in range(qvel.shape[1]):
         qvel[arm, joint] = 0.0
