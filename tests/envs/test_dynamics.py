@@ -1,4 +1,4 @@
-"""The environments on the dynamic backend: torques, contacts, random parameters and divergence."""
+"""The environments on the dynamic backends: torques, contacts, random parameters and divergence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,24 @@ RANGES = {
     "latency": (0.0, 0.04),
     "sensor_noise": (0.0, 1e-3),
 }
+KEYWORDS: dict[str, Any] = {
+    "control_period": 0.04,
+    "physics_step": 0.002,
+    "max_joint_velocity": 1.2,
+    "servo_gain": 12.0,
+    "on_divergence": "truncate",
+    "randomisation": RANGES,
+    "velocity_filter": 0.05,
+    "on_collision": "terminate",
+    "target_position": [-0.3, 0.1, 0.8],
+}
 STILL = np.zeros(6, np.float32)
+
+
+@pytest.fixture(params=["dart", "mujoco"])
+def engine(request: pytest.FixtureRequest) -> str:
+    """The backends with dynamics that run on every machine."""
+    return str(request.param)
 
 
 def _steps(env: MaraEnv, count: int, seed: int = 0) -> list[Any]:
@@ -37,20 +54,40 @@ def _steps(env: MaraEnv, count: int, seed: int = 0) -> list[Any]:
 
 
 @pytest.mark.filterwarnings("ignore:.*has a wrapper applied")
-@pytest.mark.parametrize("name", ENV_IDS)
+@pytest.mark.parametrize("name", [ENV_IDS[0], ENV_IDS[3]])
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
 @pytest.mark.parametrize("options", [{}, {"randomisation": RANGES}], ids=["plain", "random"])
 def test_the_checkers_accept_the_environments_with_rescaled_actions(
-    name: str, check: Callable[[gymnasium.Env[Any, Any]], None], options: dict[str, Any]
+    name: str,
+    check: Callable[[gymnasium.Env[Any, Any]], None],
+    options: dict[str, Any],
+    engine: str,
 ) -> None:
-    env = gymnasium.make(name, backend="dart", disable_env_checker=True, **options)
+    env = gymnasium.make(name, backend=engine, disable_env_checker=True, **options)
     rescaled = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     check(rescaled)
     rescaled.close()
 
 
-def test_info_has_torques_and_contacts() -> None:
-    env = MaraEnv("MARACollision-v0", backend="dart", start_q=COLLIDING_Q, on_collision="continue")
+def test_the_same_keywords_run_on_every_engine(engine: str) -> None:
+    def played(backend: str) -> tuple[Any, dict[str, Any]]:
+        envs = MaraVectorEnv(2, "MARACollisionOrient-v0", backend=backend, **KEYWORDS)
+        envs.reset(seed=7)
+        for _ in range(25):
+            *_, info = envs.step(np.full((2, 6), 0.4))
+        q = envs.simulation.backend.state.q
+        envs.close()
+        return q, info
+
+    (q, info), (expected_q, expected) = played(engine), played("dart")
+    assert info.keys() == expected.keys()
+    for name in RANGES:
+        np.testing.assert_array_equal(info[name], expected[name], err_msg=name)
+    np.testing.assert_allclose(q, expected_q, atol=2e-3)
+
+
+def test_info_has_torques_and_contacts(engine: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=engine, start_q=COLLIDING_Q, on_collision="continue")
     _, info = env.reset(seed=0)
     assert info["contacts"]
     _, _, _, _, info = env.step(np.array(COLLIDING_Q, np.float32))
@@ -60,8 +97,8 @@ def test_info_has_torques_and_contacts() -> None:
     assert "table" in {link for contact in info["contacts"] for link in contact["links"]}
 
 
-def test_a_collision_resets_the_arm_to_its_start() -> None:
-    env = MaraEnv("MARACollision-v0", backend="dart")
+def test_a_collision_resets_the_arm_to_its_start(engine: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=engine)
     env.reset()
     for _ in range(200):
         observation, _, terminated, truncated, info = env.step(np.array(COLLIDING_Q, np.float32))
@@ -74,8 +111,8 @@ def test_a_collision_resets_the_arm_to_its_start() -> None:
     assert np.abs(env.step(STILL)[0][:6]).max() < 1e-6
 
 
-def test_each_episode_draws_new_random_parameters_from_the_seed() -> None:
-    env = MaraEnv(backend="dart", randomisation=RANGES)
+def test_each_episode_draws_new_random_parameters_from_the_seed(engine: str) -> None:
+    env = MaraEnv(backend=engine, randomisation=RANGES)
     drawn = []
     for seed in (3, None, None, 3, None):
         _, info = env.reset(seed=seed)
@@ -89,8 +126,8 @@ def test_each_episode_draws_new_random_parameters_from_the_seed() -> None:
     assert str({name: np.array(later[name]) for name in RANGES}) == str(drawn[4])
 
 
-def test_a_collision_draws_no_new_parameters() -> None:
-    env = MaraEnv("MARACollision-v0", backend="dart", randomisation={"mass": (0.8, 1.2)})
+def test_a_collision_draws_no_new_parameters(engine: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=engine, randomisation={"mass": (0.8, 1.2)})
     _, info = env.reset(seed=0)
     for _ in range(200):
         _, _, _, _, now = env.step(np.array(COLLIDING_Q, np.float32))
@@ -100,16 +137,16 @@ def test_a_collision_draws_no_new_parameters() -> None:
     np.testing.assert_array_equal(env.step(STILL)[4]["mass"], info["mass"])
 
 
-def test_without_ranges_nothing_is_random() -> None:
-    env = MaraEnv(backend="dart")
+def test_without_ranges_nothing_is_random(engine: str) -> None:
+    env = MaraEnv(backend=engine)
     env.reset(seed=0)
     first = str(_steps(env, 5))
     env.reset(seed=1)
     assert str(_steps(env, 5)) == first
 
 
-def test_latency_delays_the_effect_of_an_action() -> None:
-    env = MaraEnv(backend="dart", randomisation={"latency": (0.05, 0.05)})
+def test_latency_delays_the_effect_of_an_action(engine: str) -> None:
+    env = MaraEnv(backend=engine, randomisation={"latency": (0.05, 0.05)})
     env.reset(seed=0)
     moved = [np.abs(env.step(STILL + 0.5)[0][:6]).max() for _ in range(4)]
     assert moved[0] < 1e-6
@@ -120,9 +157,9 @@ def test_latency_delays_the_effect_of_an_action() -> None:
     np.testing.assert_allclose(moved[3], 0.030 * 1.57, rtol=0.1)
 
 
-def test_sensor_noise_changes_the_observation_but_not_the_reward() -> None:
-    env = MaraEnv(backend="dart", randomisation={"sensor_noise": (0.01, 0.01)})
-    noiseless = MaraEnv(backend="dart")
+def test_sensor_noise_changes_the_observation_but_not_the_reward(engine: str) -> None:
+    env = MaraEnv(backend=engine, randomisation={"sensor_noise": (0.01, 0.01)})
+    noiseless = MaraEnv(backend=engine)
     env.reset(seed=0)
     noiseless.reset(seed=0)
     measured = []
@@ -135,8 +172,8 @@ def test_sensor_noise_changes_the_observation_but_not_the_reward() -> None:
     np.testing.assert_allclose(np.std(measured, axis=0), 0.01, rtol=0.25)
 
 
-def test_arms_without_a_first_episode_do_not_affect_the_others() -> None:
-    envs = MaraVectorEnv(2, backend="dart", randomisation={"sensor_noise": (0.01, 0.01)}, workers=1)
+def test_arms_without_a_first_episode_do_not_affect_the_others(engine: str) -> None:
+    envs = MaraVectorEnv(2, backend=engine, randomisation={"sensor_noise": (0.01, 0.01)})
     envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
     observation, *_ = envs.step(np.zeros((2, 6)))
     assert (observation[0, :6] != 0.0).any()
@@ -145,9 +182,9 @@ def test_arms_without_a_first_episode_do_not_affect_the_others() -> None:
 
 @pytest.mark.parametrize("duplicate", COPIES)
 def test_a_copy_in_mid_episode_continues_identically(
-    duplicate: Callable[[MaraEnv], MaraEnv],
+    duplicate: Callable[[MaraEnv], MaraEnv], engine: str
 ) -> None:
-    env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
+    env = MaraEnv("MARACollisionOrient-v0", backend=engine, randomisation=RANGES)
     env.reset(seed=0)
     _steps(env, 5)
     other = duplicate(env)
@@ -155,8 +192,8 @@ def test_a_copy_in_mid_episode_continues_identically(
     assert str(env.reset()) == str(other.reset())
 
 
-def test_restore_state_returns_to_a_snapshot() -> None:
-    env = MaraEnv("MARACollisionOrient-v0", backend="dart", randomisation=RANGES)
+def test_restore_state_returns_to_a_snapshot(engine: str) -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend=engine, randomisation=RANGES)
     env.reset(seed=0)
     _steps(env, 5)
     snapshot = env.save_state()
