@@ -98,6 +98,7 @@ class MujocoBackend(ServoBackend):
         self._follower_v = [1 + nq + each.dofadr.item() for each in followers]
         self._states = np.zeros((num_envs, 1 + nq + nv))
         self._warmstarts = np.zeros((num_envs, nv))
+        self._effort_limit = np.tile(robot.effort_limit, (num_envs, 1))
         self._controls = np.empty((num_envs, len(self._times), joints))
         self._whole_time = (len(self._times) - 0.5) * self.physics_step
         self.reset(np.tile(robot.home, (num_envs, 1)))
@@ -117,6 +118,8 @@ class MujocoBackend(ServoBackend):
         if np.count_nonzero(stopped):
             qd[stopped] = np.nan
         torque = (velocities[-1] - end[:, self._shaft_v]) * (SHAFT_INERTIA / self.physics_step)
+        # Without the errors of rounding, about 1e-9 Nm.
+        torque = np.minimum(np.maximum(torque, -self._effort_limit), self._effort_limit)
         return Motion(end[:, self._joint_q].copy(), qd, torque, contacts)
 
     def _q_of(self, states: Floats, path: Floats) -> Floats:
@@ -144,6 +147,8 @@ class MujocoBackend(ServoBackend):
 
     def _set_parameters(self, arm: int, parameters: Mapping[str, Floats]) -> None:
         own = {name: parameters[name] for name in _OF_ENGINE & parameters.keys()}
+        if "effort_limit" in own:
+            self._effort_limit[arm] = own["effort_limit"] * self.robot.effort_limit
         set_parameters(self._models[arm], self._model, **own)
 
     def save(self) -> dict[str, Any]:
