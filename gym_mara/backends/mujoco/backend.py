@@ -93,7 +93,7 @@ class MujocoBackend(ServoBackend):
         self._models = [self._model] * num_envs
         if own_models:
             self._models = [copy.copy(self._model) for _ in range(num_envs)]
-        self._still = without_forces(self._model)
+        self._stills = [without_forces(self._model)] * num_envs
         # MuJoCo's state: time, positions, velocities. Joints come first, the motors' shafts last.
         joints, nq, nv = robot.num_joints, self._model.nq, self._model.nv
         self._joint_q, self._joint_v = slice(1, 1 + joints), slice(1 + nq, 1 + nq + joints)
@@ -107,6 +107,10 @@ class MujocoBackend(ServoBackend):
         self._effort_limit = np.tile(robot.effort_limit, (num_envs, 1))
         steps = len(self._times) - 1
         self._controls = np.empty((num_envs, steps, joints))
+        self._no_controls, self._no_warmstarts = (
+            np.zeros((num_envs, 1, joints)),
+            np.zeros((num_envs, nv)),
+        )
         self._whole_time = (steps - 0.5) * self.physics_step
         self.reset(np.tile(robot.home, (num_envs, 1)))
 
@@ -117,8 +121,11 @@ class MujocoBackend(ServoBackend):
         path, during = self._stepper.run(self._models, states, self._warmstarts, self._controls)
         end = path[:, -1].copy()
         # A step finds the contacts at its beginning, so those at the end are still unknown.
-        distances = np.concatenate([during, self._distances(end)], axis=1)
-        contacts = self._contact_finder.find(distances, lambda: self._joint_paths(states, path))
+        after = self._distances(end)
+        contacts: list[tuple[Contact, ...]] = [()] * self.num_envs
+        if np.count_nonzero(during) or np.count_nonzero(after):
+            distances = np.concatenate([during, after], axis=1)
+            contacts = self._contact_finder.find(distances, lambda: self._joint_paths(states, path))
         before = path[:, -2] if len(velocities) > 1 else states
         self._warmstarts = (end[:, self._v] - before[:, self._v]) / self.physics_step
         self._states = end
@@ -133,9 +140,8 @@ class MujocoBackend(ServoBackend):
 
     def _distances(self, states: Floats) -> Floats:
         """The distance of each of `link_pairs` in n states (n, 1, P), m; negative in contact, else 0."""
-        count, (_, _, controls) = len(states), self._controls.shape
-        none = np.zeros((count, self._model.nv)), np.zeros((count, 1, controls))
-        return self._stepper.run([self._still] * count, states, *none)[1]
+        none = self._no_warmstarts[: len(states)], self._no_controls[: len(states)]
+        return self._stepper.run(self._stills[: len(states)], states, *none)[1]
 
     def _joint_paths(self, states: Floats, path: Floats) -> Floats:
         """The joint positions before the first step and after each step (N, K + 1, J)."""
