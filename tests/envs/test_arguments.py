@@ -177,6 +177,8 @@ def test_ranges_can_be_arrays() -> None:
     [
         ({"num_envs": 10**12}, "num_envs must be at most 1048576, because the arms of .*memory"),
         ({"num_envs": 20_000, "backend": "dart"}, "num_envs must be at most 16384, because"),
+        ({"num_envs": 70_000, "backend": "mujoco"}, "num_envs must be at most 65536, because"),
+        ({"threads": 10**6, "backend": "mujoco"}, "threads must be at most .*, because"),
         ({"num_envs": 10**19}, "num_envs must be at most 9007199254740992, because"),
         ({"control_period": 1e9}, r"control_period must be at most 1000 \(s\), because"),
         ({"control_period": 1e-7}, r"control_period must be at least 1e-06 \(s\), because"),

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.mujoco.backend import MujocoBackend
 from gym_mara.backends.servo import SimulationDivergedError
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
@@ -42,9 +43,14 @@ STILL = np.zeros(6, np.float32)
 
 
 @pytest.fixture(params=["dart", "mujoco"])
-def engine(request: pytest.FixtureRequest) -> str:
-    """The backends with dynamics that run on every machine."""
+def backend(request: pytest.FixtureRequest) -> str:
     return str(request.param)
+
+
+@pytest.fixture
+def in_one_process(backend: str) -> dict[str, Any]:
+    """The keyword arguments of environments on this backend that start no process."""
+    return {"backend": backend} | ({"workers": 1} if backend == "dart" else {})
 
 
 def _steps(env: MaraEnv, count: int, seed: int = 0) -> list[Any]:
@@ -58,36 +64,35 @@ def _steps(env: MaraEnv, count: int, seed: int = 0) -> list[Any]:
 @pytest.mark.parametrize("check", [check_env, sb3_check_env], ids=["gymnasium", "sb3"])
 @pytest.mark.parametrize("options", [{}, {"randomisation": RANGES}], ids=["plain", "random"])
 def test_the_checkers_accept_the_environments_with_rescaled_actions(
+    backend: str,
     name: str,
     check: Callable[[gymnasium.Env[Any, Any]], None],
     options: dict[str, Any],
-    engine: str,
 ) -> None:
-    env = gymnasium.make(name, backend=engine, disable_env_checker=True, **options)
+    env = gymnasium.make(name, backend=backend, disable_env_checker=True, **options)
     rescaled = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     check(rescaled)
     rescaled.close()
 
 
-def test_the_same_keywords_run_on_every_engine(engine: str) -> None:
-    def played(backend: str) -> tuple[Any, dict[str, Any]]:
+def test_the_same_keywords_run_on_both_engines() -> None:
+    played = {}
+    for backend in ("dart", "mujoco"):
         envs = MaraVectorEnv(2, "MARACollisionOrient-v0", backend=backend, **KEYWORDS)
         envs.reset(seed=7)
         for _ in range(25):
             *_, info = envs.step(np.full((2, 6), 0.4))
-        q = envs.simulation.backend.state.q
+        played[backend] = envs.simulation.backend.state.q, info
         envs.close()
-        return q, info
-
-    (q, info), (expected_q, expected) = played(engine), played("dart")
+    (q, info), (expected_q, expected) = played["mujoco"], played["dart"]
     assert info.keys() == expected.keys()
     for name in RANGES:
         np.testing.assert_array_equal(info[name], expected[name], err_msg=name)
     np.testing.assert_allclose(q, expected_q, atol=2e-3)
 
 
-def test_info_has_torques_and_contacts(engine: str) -> None:
-    env = MaraEnv("MARACollision-v0", backend=engine, start_q=COLLIDING_Q, on_collision="continue")
+def test_info_has_torques_and_contacts(backend: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=backend, start_q=COLLIDING_Q, on_collision="continue")
     _, info = env.reset(seed=0)
     assert info["contacts"]
     _, _, _, _, info = env.step(np.array(COLLIDING_Q, np.float32))
@@ -97,8 +102,8 @@ def test_info_has_torques_and_contacts(engine: str) -> None:
     assert "table" in {link for contact in info["contacts"] for link in contact["links"]}
 
 
-def test_a_collision_resets_the_arm_to_its_start(engine: str) -> None:
-    env = MaraEnv("MARACollision-v0", backend=engine)
+def test_a_collision_resets_the_arm_to_its_start(backend: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=backend)
     env.reset()
     for _ in range(200):
         observation, _, terminated, truncated, info = env.step(np.array(COLLIDING_Q, np.float32))
@@ -111,8 +116,8 @@ def test_a_collision_resets_the_arm_to_its_start(engine: str) -> None:
     assert np.abs(env.step(STILL)[0][:6]).max() < 1e-6
 
 
-def test_each_episode_draws_new_random_parameters_from_the_seed(engine: str) -> None:
-    env = MaraEnv(backend=engine, randomisation=RANGES)
+def test_each_episode_draws_new_random_parameters_from_the_seed(backend: str) -> None:
+    env = MaraEnv(backend=backend, randomisation=RANGES)
     drawn = []
     for seed in (3, None, None, 3, None):
         _, info = env.reset(seed=seed)
@@ -126,8 +131,8 @@ def test_each_episode_draws_new_random_parameters_from_the_seed(engine: str) -> 
     assert str({name: np.array(later[name]) for name in RANGES}) == str(drawn[4])
 
 
-def test_a_collision_draws_no_new_parameters(engine: str) -> None:
-    env = MaraEnv("MARACollision-v0", backend=engine, randomisation={"mass": (0.8, 1.2)})
+def test_a_collision_draws_no_new_parameters(backend: str) -> None:
+    env = MaraEnv("MARACollision-v0", backend=backend, randomisation={"mass": (0.8, 1.2)})
     _, info = env.reset(seed=0)
     for _ in range(200):
         _, _, _, _, now = env.step(np.array(COLLIDING_Q, np.float32))
@@ -137,16 +142,16 @@ def test_a_collision_draws_no_new_parameters(engine: str) -> None:
     np.testing.assert_array_equal(env.step(STILL)[4]["mass"], info["mass"])
 
 
-def test_without_ranges_nothing_is_random(engine: str) -> None:
-    env = MaraEnv(backend=engine)
+def test_without_ranges_nothing_is_random(backend: str) -> None:
+    env = MaraEnv(backend=backend)
     env.reset(seed=0)
     first = str(_steps(env, 5))
     env.reset(seed=1)
     assert str(_steps(env, 5)) == first
 
 
-def test_latency_delays_the_effect_of_an_action(engine: str) -> None:
-    env = MaraEnv(backend=engine, randomisation={"latency": (0.05, 0.05)})
+def test_latency_delays_the_effect_of_an_action(backend: str) -> None:
+    env = MaraEnv(backend=backend, randomisation={"latency": (0.05, 0.05)})
     env.reset(seed=0)
     moved = [np.abs(env.step(STILL + 0.5)[0][:6]).max() for _ in range(4)]
     assert moved[0] < 1e-6
@@ -157,9 +162,9 @@ def test_latency_delays_the_effect_of_an_action(engine: str) -> None:
     np.testing.assert_allclose(moved[3], 0.030 * 1.57, rtol=0.1)
 
 
-def test_sensor_noise_changes_the_observation_but_not_the_reward(engine: str) -> None:
-    env = MaraEnv(backend=engine, randomisation={"sensor_noise": (0.01, 0.01)})
-    noiseless = MaraEnv(backend=engine)
+def test_sensor_noise_changes_the_observation_but_not_the_reward(backend: str) -> None:
+    env = MaraEnv(backend=backend, randomisation={"sensor_noise": (0.01, 0.01)})
+    noiseless = MaraEnv(backend=backend)
     env.reset(seed=0)
     noiseless.reset(seed=0)
     measured = []
@@ -172,8 +177,10 @@ def test_sensor_noise_changes_the_observation_but_not_the_reward(engine: str) ->
     np.testing.assert_allclose(np.std(measured, axis=0), 0.01, rtol=0.25)
 
 
-def test_arms_without_a_first_episode_do_not_affect_the_others(engine: str) -> None:
-    envs = MaraVectorEnv(2, backend=engine, randomisation={"sensor_noise": (0.01, 0.01)})
+def test_arms_without_a_first_episode_do_not_affect_the_others(
+    in_one_process: dict[str, Any],
+) -> None:
+    envs = MaraVectorEnv(2, **in_one_process, randomisation={"sensor_noise": (0.01, 0.01)})
     envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
     observation, *_ = envs.step(np.zeros((2, 6)))
     assert (observation[0, :6] != 0.0).any()
@@ -182,9 +189,10 @@ def test_arms_without_a_first_episode_do_not_affect_the_others(engine: str) -> N
 
 @pytest.mark.parametrize("duplicate", COPIES)
 def test_a_copy_in_mid_episode_continues_identically(
-    duplicate: Callable[[MaraEnv], MaraEnv], engine: str
+    backend: str,
+    duplicate: Callable[[MaraEnv], MaraEnv],
 ) -> None:
-    env = MaraEnv("MARACollisionOrient-v0", backend=engine, randomisation=RANGES)
+    env = MaraEnv("MARACollisionOrient-v0", backend=backend, randomisation=RANGES)
     env.reset(seed=0)
     _steps(env, 5)
     other = duplicate(env)
@@ -192,8 +200,8 @@ def test_a_copy_in_mid_episode_continues_identically(
     assert str(env.reset()) == str(other.reset())
 
 
-def test_restore_state_returns_to_a_snapshot(engine: str) -> None:
-    env = MaraEnv("MARACollisionOrient-v0", backend=engine, randomisation=RANGES)
+def test_restore_state_returns_to_a_snapshot(backend: str) -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend=backend, randomisation=RANGES)
     env.reset(seed=0)
     _steps(env, 5)
     snapshot = env.save_state()
@@ -206,20 +214,23 @@ def test_restore_state_returns_to_a_snapshot(engine: str) -> None:
 def _diverge(env: MaraEnv | MaraVectorEnv, arm: int = 0) -> None:
     """Give an arm so large a velocity that its state diverges in the next step."""
     backend = env.simulation.backend
-    assert isinstance(backend, DartBackend)
-    backend.arms[arm].set_state(np.zeros(6), np.full(6, 1e200))
+    if isinstance(backend, DartBackend):
+        backend.arms[arm].set_state(np.zeros(6), np.full(6, 1e200))
+    else:
+        assert isinstance(backend, MujocoBackend)
+        backend._states[arm, backend._joint_v] = 1e200
 
 
-def test_divergence_raises_an_error_by_default() -> None:
-    env = MaraEnv(backend="dart")
+def test_divergence_raises_an_error_by_default(backend: str) -> None:
+    env = MaraEnv(backend=backend)
     env.reset()
     _diverge(env)
     with pytest.raises(SimulationDivergedError, match="on_divergence='truncate'"):
         env.step(STILL)
 
 
-def test_divergence_can_truncate_the_episode_and_gives_no_nan() -> None:
-    env = MaraEnv("MARACollisionOrient-v0", backend="dart", on_divergence="truncate")
+def test_divergence_can_truncate_the_episode_and_gives_no_nan(backend: str) -> None:
+    env = MaraEnv("MARACollisionOrient-v0", backend=backend, on_divergence="truncate")
     env.reset()
     env.step(STILL + 0.1)
     _diverge(env)
@@ -231,10 +242,10 @@ def test_divergence_can_truncate_the_episode_and_gives_no_nan() -> None:
     assert not env.step(STILL + 0.1)[3]
 
 
-def test_in_a_vector_env_only_the_diverged_arm_begins_a_new_episode() -> None:
-    envs = MaraVectorEnv(
-        3, backend="dart", on_divergence="truncate", autoreset_mode="SameStep", workers=1
-    )
+def test_in_a_vector_env_only_the_diverged_arm_begins_a_new_episode(
+    in_one_process: dict[str, Any],
+) -> None:
+    envs = MaraVectorEnv(3, **in_one_process, on_divergence="truncate", autoreset_mode="SameStep")
     envs.reset()
     for _ in range(3):
         envs.step(np.full((3, 6), 0.3))
@@ -248,13 +259,15 @@ def test_in_a_vector_env_only_the_diverged_arm_begins_a_new_episode() -> None:
     assert (observation[[0, 2], :6] > 0.05).all()
 
 
-def test_the_error_for_missing_dart_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("backend", "library"), [("dart", "dartpy"), ("mujoco", "mujoco")])
+def test_the_error_for_a_missing_engine_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, backend: str, library: str
 ) -> None:
     import sys
 
-    for module in [name for name in sys.modules if name.startswith("gym_mara.backends.dart")]:
+    ours = f"gym_mara.backends.{backend}"
+    for module in [name for name in sys.modules if name.startswith(ours)]:
         monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.setitem(sys.modules, "dartpy", None)
-    with pytest.raises(GymMaraError, match=r"pip install 'gym_mara\[dart\]'"):
-        MaraEnv(backend="dart")
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(GymMaraError, match=rf"pip install 'gym_mara\[{backend}\]'"):
+        MaraEnv(backend=backend)

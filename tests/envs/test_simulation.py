@@ -25,7 +25,9 @@ def test_the_outcome_has_the_rewarded_state_even_after_a_reset_by_a_collision() 
     assert not env.simulation.backend.state.collided.any(), "the collision reset the arm"
 
 
-@pytest.mark.parametrize(("old", "new"), [("pinocchio", "dart"), ("dart", "pinocchio")])
+@pytest.mark.parametrize(
+    ("old", "new"), [("pinocchio", "dart"), ("dart", "mujoco"), ("mujoco", "pinocchio")]
+)
 def test_a_switch_of_the_backend_keeps_the_joints_and_the_goal(old: str, new: str) -> None:
     env = MaraEnv(backend=old, control_period=0.02)
     env.reset(seed=0)

@@ -28,6 +28,12 @@ CASES: dict[str, dict[str, Any]] = {
     "teleport": {},
     "travel": {"max_joint_velocity": 2.0, "control_period": 0.2},
     "noise": {**DYNAMIC, "control_period": 0.05, "physics_step": 0.005},
+    "noise, mujoco": {
+        **DYNAMIC,
+        "backend": "mujoco",
+        "control_period": 0.05,
+        "physics_step": 0.005,
+    },
 }
 IDS = ("gym_mara/MARARandomTarget-v0", "gym_mara/MARACollisionOrient-v0", "gym_mara/MARAGoal-v0")
 
@@ -220,7 +226,7 @@ def test_a_snapshot_of_another_environment_is_refused_and_changes_nothing(
     assert repr(env.reset()) == repr(same.reset())
 
 
-@pytest.mark.parametrize("backend", ["pinocchio", "dart"])
+@pytest.mark.parametrize("backend", ["pinocchio", "dart", "mujoco"])
 def test_a_snapshot_of_another_batch_is_refused(backend: str) -> None:
     env = MaraVectorEnv(2, backend=backend)
     env.reset(seed=1)

@@ -140,12 +140,12 @@ def test_another_backend_gives_the_results_of_single_envs(
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("count", [3, 4])
-def test_random_episodes_of_the_dynamic_backend_equal_those_of_single_envs(
-    mara: RobotModel, mode: str, count: int
+@pytest.mark.parametrize(("backend", "count"), [("dart", 3), ("dart", 4), ("mujoco", 3)])
+def test_random_episodes_of_a_dynamic_backend_equal_those_of_single_envs(
+    mara: RobotModel, mode: str, backend: str, count: int
 ) -> None:
     ranges = {"mass": (0.5, 1.5), "latency": (0.0, 0.05), "sensor_noise": (0.0, 0.01)}
-    options = {"robot": mara, "backend": "dart", "randomisation": ranges}
+    options = {"robot": mara, "backend": backend, "randomisation": ranges}
     start = (1.4, 1.9, 0.0, 0.0, 0.0, 0.0)  # just above the table
     native, singles = _pair(
         "gym_mara/MARACollisionOrient-v0",

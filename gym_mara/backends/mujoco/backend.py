@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends.mujoco.contacts import ContactFinder
-from gym_mara.backends.mujoco.model import SHAFT_INERTIA, build_model, set_parameters
+from gym_mara.backends.mujoco.model import (
+    SHAFT_INERTIA,
+    build_model,
+    set_parameters,
+    without_forces,
+)
 from gym_mara.backends.mujoco.threads import Stepper, choose_threads
 from gym_mara.backends.servo import Motion, ServoBackend
 from gym_mara.errors import GymMaraError
@@ -88,6 +93,7 @@ class MujocoBackend(ServoBackend):
         self._models = [self._model] * num_envs
         if own_models:
             self._models = [copy.copy(self._model) for _ in range(num_envs)]
+        self._stills = [without_forces(self._model)] * num_envs
         # MuJoCo's state: time, positions, velocities. Joints come first, the motors' shafts last.
         joints, nq, nv = robot.num_joints, self._model.nq, self._model.nv
         self._joint_q, self._joint_v = slice(1, 1 + joints), slice(1 + nq, 1 + nq + joints)
@@ -98,38 +104,53 @@ class MujocoBackend(ServoBackend):
         self._follower_v = [1 + nq + each.dofadr.item() for each in followers]
         self._states = np.zeros((num_envs, 1 + nq + nv))
         self._warmstarts = np.zeros((num_envs, nv))
-        self._controls = np.empty((num_envs, len(self._times), joints))
-        self._whole_time = (len(self._times) - 0.5) * self.physics_step
+        self._effort_limit = np.tile(robot.effort_limit, (num_envs, 1))
+        steps = len(self._times) - 1
+        self._controls = np.empty((num_envs, steps, joints))
+        self._no_controls, self._no_warmstarts = (
+            np.zeros((num_envs, 1, joints)),
+            np.zeros((num_envs, nv)),
+        )
+        self._whole_time = (steps - 0.5) * self.physics_step
         self.reset(np.tile(robot.home, (num_envs, 1)))
 
     def _run(self, velocities: Floats) -> Motion:
-        controls, states = self._controls, self._states
-        # Contacts are found at the beginning of a step, so one more shows those at the end of the period.
-        controls[:, :-1], controls[:, -1] = velocities.swapaxes(0, 1), velocities[-1]
+        states, last = self._states, velocities[-1]
         states[:, 0], states[:, self._shaft_q], states[:, self._shaft_v] = 0.0, 0.0, velocities[0]
-        path, distances = self._stepper.run(self._models, states, self._warmstarts, controls)
-        end, beyond = path[:, -2].copy(), path[:, -1]
-        contacts = self._contact_finder.find(distances, lambda: self._q_of(states, path))
+        self._controls[...] = velocities.swapaxes(0, 1)
+        path, during = self._stepper.run(self._models, states, self._warmstarts, self._controls)
+        end = path[:, -1].copy()
+        # A step finds the contacts at its beginning, so those at the end are still unknown.
+        after = self._distances(end)
+        contacts: list[tuple[Contact, ...]] = [()] * self.num_envs
+        if np.count_nonzero(during) or np.count_nonzero(after):
+            distances = np.concatenate([during, after], axis=1)
+            contacts = self._contact_finder.find(distances, lambda: self._joint_paths(states, path))
+        before = path[:, -2] if len(velocities) > 1 else states
+        self._warmstarts = (end[:, self._v] - before[:, self._v]) / self.physics_step
         self._states = end
-        self._warmstarts = (beyond[:, self._v] - end[:, self._v]) / self.physics_step
         qd = end[:, self._joint_v].copy()
-        stopped = beyond[:, 0] < self._whole_time
+        stopped = end[:, 0] < self._whole_time
         if np.count_nonzero(stopped):
             qd[stopped] = np.nan
-        torque = (velocities[-1] - end[:, self._shaft_v]) * (SHAFT_INERTIA / self.physics_step)
+        torque = (last - end[:, self._shaft_v]) * (SHAFT_INERTIA / self.physics_step)
+        # Without the errors of rounding, about 1e-9 Nm.
+        torque = np.minimum(np.maximum(torque, -self._effort_limit), self._effort_limit)
         return Motion(end[:, self._joint_q].copy(), qd, torque, contacts)
 
-    def _q_of(self, states: Floats, path: Floats) -> Floats:
-        """The joint positions at the beginning of each step (N, K, J)."""
-        return np.concatenate([states[:, None], path[:, :-1]], axis=1)[..., self._joint_q]
+    def _distances(self, states: Floats) -> Floats:
+        """The distance of each of `link_pairs` in n states (n, 1, P), m; negative in contact, else 0."""
+        none = self._no_warmstarts[: len(states)], self._no_controls[: len(states)]
+        return self._stepper.run(self._stills[: len(states)], states, *none)[1]
+
+    def _joint_paths(self, states: Floats, path: Floats) -> Floats:
+        """The joint positions before the first step and after each step (N, K + 1, J)."""
+        return np.concatenate([states[:, None], path], axis=1)[..., self._joint_q]
 
     def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
         for arm, row in zip(arms.tolist(), q, strict=True):
             self._set_state(arm, row, np.zeros_like(row))
-        models = [self._models[arm] for arm in arms.tolist()]
-        none = np.zeros((len(arms), 1, self.robot.num_joints))
-        _, distances = self._stepper.run(models, self._states[arms], self._warmstarts[arms], none)
-        return self._contact_finder.find(distances, lambda: q[:, None])
+        return self._contact_finder.find(self._distances(self._states[arms]), lambda: q[:, None])
 
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         self._set_state(arm, q, qd)
@@ -144,6 +165,8 @@ class MujocoBackend(ServoBackend):
 
     def _set_parameters(self, arm: int, parameters: Mapping[str, Floats]) -> None:
         own = {name: parameters[name] for name in _OF_ENGINE & parameters.keys()}
+        if "effort_limit" in own:
+            self._effort_limit[arm] = own["effort_limit"] * self.robot.effort_limit
         set_parameters(self._models[arm], self._model, **own)
 
     def save(self) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,18 @@ def set_parameters(
         model.body_mass[bodies] = mass * nominal.body_mass[bodies]
         model.body_inertia[bodies] = mass[:, None] * nominal.body_inertia[bodies]
         mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def without_forces(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy in which nothing but contacts acts, for steps that only measure distances: they take half the time."""
+    still = copy.copy(model)
+    bits = mujoco.mjtDisableBit
+    for bit in (
+        *(bits.mjDSBL_EQUALITY, bits.mjDSBL_FRICTIONLOSS, bits.mjDSBL_LIMIT, bits.mjDSBL_WARMSTART),
+        *(bits.mjDSBL_ACTUATION, bits.mjDSBL_GRAVITY, bits.mjDSBL_EULERDAMP),
+    ):
+        still.opt.disableflags |= bit.value
+    return still
 
 
 def link_pairs(robot: RobotModel) -> list[tuple[str, str]]:

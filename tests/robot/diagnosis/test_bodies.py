@@ -34,25 +34,27 @@ def test_an_arm_without_a_fault_has_no_findings(tmp_path: Path) -> None:
     assert RobotModel.load(arm_file(tmp_path), TOOL).findings == ()
 
 
+@pytest.mark.parametrize("backend", ["dart", "mujoco"])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_only_backends_with_dynamics_refuse_what_they_cannot_simulate(
-    tmp_path: Path, fault: str
+    tmp_path: Path, fault: str, backend: str
 ) -> None:
     text, message = FAULTS[fault]
     robot = RobotModel.load(arm_file(tmp_path, text), TOOL)
     make_backend("pinocchio", robot, 1, {})
     with pytest.raises(GymMaraError, match=message) as refused:
-        make_backend("dart", robot, 1, {})
+        make_backend(backend, robot, 1, {})
     assert "default_mass=…" in str(refused.value)
 
 
+@pytest.mark.parametrize("name", ["dart", "mujoco"])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_default_mass_mends_them_and_the_arm_moves_to_its_target(
-    tmp_path: Path, fault: str
+    tmp_path: Path, fault: str, name: str
 ) -> None:
     robot = RobotModel.load(arm_file(tmp_path, FAULTS[fault][0]), TOOL, default_mass=1.0)
     assert not [finding for finding in robot.findings if finding.dynamics]
-    backend = make_backend("dart", robot, 1, {})
+    backend = make_backend(name, robot, 1, {})
     target = np.array([[0.5, 0.6, -0.7]])
     for _ in range(150):
         state = backend.step(target)

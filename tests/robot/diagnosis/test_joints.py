@@ -28,15 +28,16 @@ FAULTS = {
 }
 
 
+@pytest.mark.parametrize("backend", ["dart", "mujoco"])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_only_backends_with_dynamics_refuse_limits_that_are_zero_or_missing(
-    tmp_path: Path, fault: str
+    tmp_path: Path, fault: str, backend: str
 ) -> None:
     text, message, remedy = FAULTS[fault]
     robot = RobotModel.load(arm_file(tmp_path, text), TOOL)
     make_backend("pinocchio", robot, 1, {})
     with pytest.raises(GymMaraError, match=f"joints j1, j2, j3: {message}") as refused:
-        make_backend("dart", robot, 1, {})
+        make_backend(backend, robot, 1, {})
     assert remedy in str(refused.value)
 
 
@@ -107,10 +108,11 @@ def test_the_weight_in_the_start_pose_is_that_of_the_start_pose(tmp_path: Path) 
         RobotModel.load(arm_file(tmp_path, text), TOOL).require_dynamics()
 
 
-def test_a_motor_that_cannot_hold_the_arm_at_home_is_a_warning(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["dart", "mujoco"])
+def test_a_motor_that_cannot_hold_the_arm_at_home_is_a_warning(tmp_path: Path, name: str) -> None:
     robot = RobotModel.load(arm_file(tmp_path, _lying(3.0)), TOOL)
     with pytest.warns(UserWarning, match=r"joint j2: .* in its start pose: 3 < 5\.89 Nm") as warned:
-        backend = make_backend("dart", robot, 1, {})
+        backend = make_backend(name, robot, 1, {})
     assert len(warned) == 1
     for _ in range(25):
         state = backend.step(robot.home[None])
@@ -124,9 +126,10 @@ def test_a_motor_that_cannot_hold_the_arm_elsewhere_is_a_warning(tmp_path: Path)
     assert len(warned) == 1
 
 
-def test_a_motor_that_just_holds_the_arm_is_no_warning(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["dart", "mujoco"])
+def test_a_motor_that_just_holds_the_arm_is_no_warning(tmp_path: Path, name: str) -> None:
     robot = RobotModel.load(arm_file(tmp_path, _lying(5.9)), TOOL)
-    backend = make_backend("dart", robot, 1, {})
+    backend = make_backend(name, robot, 1, {})
     for _ in range(25):
         state = backend.step(robot.home[None])
     np.testing.assert_allclose(state.q[0], robot.home, atol=1e-3)
