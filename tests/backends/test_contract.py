@@ -57,16 +57,16 @@ RANDOM = {
 }
 TRAVELLING = {"max_joint_velocity": 1.0}
 # Two physics steps, because each takes long on a CPU; and room for arms that random poses put deep into the table.
-WARP = {"device": "cpu", "physics_step": 0.004, "max_contacts": 96}
+WARP = {"device": "cpu", "control_period": 0.008, "physics_step": 0.004, "max_contacts": 96}
 OTHER_ROBOTS = ("3 joints", "7 joints", "rail")
 CASES = {
     **{name: Case(name) for name in backend_names()},
     "fake": Case("fake"),
     "warp": Case("warp", WARP),
     "warp, kinematic": Case("warp", WARP | {"dynamics": False}),
-    "warp, travelling": Case("warp", WARP | TRAVELLING | {"dynamics": False}),
+    "warp, travelling": Case("warp", WARP | {"max_joint_velocity": 1.5, "dynamics": False}),
     "warp, random": Case("warp", WARP | {"randomisation": RANDOM, "on_divergence": "truncate"}),
-    "warp, rail": Case("warp", WARP, "rail"),
+    "warp, rail": Case("warp", WARP | {"physics_step": 0.002}, "rail"),
     "pinocchio, travelling": Case("pinocchio", TRAVELLING),
     "pinocchio, fcl": Case("pinocchio", {"collision": "fcl"}),
     "pinocchio, threads": Case("pinocchio", {"collision_threads": 2}),

@@ -351,7 +351,7 @@ def test_the_memory_of_an_arm_is_known(mara: RobotModel) -> None:
 def test_a_library_that_is_missing_is_named_with_its_extra(
     mara: RobotModel, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
-    for module in ("device", "engine", "kernels", "model"):
+    for module in ("device", "engine", "kernels", "paths"):
         monkeypatch.delitem(sys.modules, f"gym_mara.backends.warp.{module}")
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingExtraError, match=r"'warp' needs .*pip install 'gym_mara\[warp\]'"):

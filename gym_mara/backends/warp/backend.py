@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,15 +26,14 @@ from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import Contact, SimState
-from gym_mara.types import Floats, Mask
+from gym_mara.types import Array, Floats, Mask
 
 with needs("the backend 'warp'", "warp"):
     pass  # the libraries are imported for the first arm, because they take seconds
 
 if TYPE_CHECKING:
-    import torch
-
     from gym_mara.backends.warp.engine import Engine
+    from gym_mara.backends.warp.exchange import NumpyExchange
 
 ARRAYS = ("numpy", "torch")
 OF_MODEL = frozenset(("mass", "effort_limit", "joint_friction", "contact_friction"))
@@ -137,9 +135,8 @@ class WarpBackend(Backend):
             for name, value in self.randomisation.nominal().items()
         }
         self._kinematics = robot.kinematics()
+        self._exchange: NumpyExchange
         self._engine = self._new_engine(device)
-        self._views: dict[int, torch.Tensor] = {}
-        """Tensors that share the memory of arrays of the engine, by address."""
         self._fresh = False
         """Whether the arrays of the engine are those of the current state."""
         self._told_of_contacts = False
@@ -156,17 +153,17 @@ class WarpBackend(Backend):
         with needs("the backend 'warp'", "warp"):
             from gym_mara.backends.warp.device import choose_device
             from gym_mara.backends.warp.engine import Engine
+            from gym_mara.backends.warp.exchange import make_exchange
 
-            if self.arrays == "torch":
-                import torch  # noqa: F401 - an error here, not in the first step
-        self._on = choose_device(device)
+            on = choose_device(device)
+            self._exchange = make_exchange(self.arrays, on)
         if self.arrays == "torch":
-            self.device = str(self._on.alias)
-        with self._scope():
+            self.device = on.alias
+        with self._exchange.scope():
             return Engine(
                 self.robot,
                 self.num_envs,
-                self._on,
+                on,
                 control_period=self.control_period,
                 physics_step=self._physics_step if self.dynamic else None,
                 late_periods=late_periods(self.randomisation, self.control_period),
@@ -177,33 +174,13 @@ class WarpBackend(Backend):
                 own_parameters=not OF_MODEL.isdisjoint(self.randomisation.ranges),
             )
 
-    @contextmanager
-    def _scope(self) -> Iterator[None]:
-        """Let Warp work on the device, and in the current stream of torch if the arrays are tensors."""
-        import warp as wp
-
-        with ExitStack() as stack:
-            stack.enter_context(wp.ScopedDevice(self._on))
-            if self.arrays == "torch" and self._on.is_cuda:
-                import torch
-
-                stream = torch.cuda.current_stream(wp.device_to_torch(self._on))
-                stack.enter_context(wp.ScopedStream(wp.stream_from_torch(stream)))
-            yield
-
     @property
     def bytes_per_arm(self) -> int:
         """How much memory of the device an arm takes, about."""
         return self._engine.bytes_per_arm
 
-    def asarray(self, values: ArrayLike) -> Any:
-        array = super().asarray(values)
-        if self.arrays == "numpy":
-            return array
-        import torch
-
-        dtype = torch.bool if array.dtype == np.bool_ else torch.float32
-        return torch.tensor(array, dtype=dtype, device=self.device)
+    def asarray(self, values: ArrayLike) -> Array:
+        return self._exchange.asarray(values)
 
     def begin_episodes(self, seeds: NDArray[np.uint64], mask: Mask) -> None:
         arms = np.flatnonzero(mask).tolist()
@@ -218,7 +195,7 @@ class WarpBackend(Backend):
         ones = np.ones((self.num_envs, self.robot.num_joints))
         latency = own.get("latency", np.zeros(self.num_envs))
         late = latency // self.control_period
-        with self._scope():
+        with self._exchange.scope():
             engine.gain.assign(self._servo_gain * own.get("servo_gain", ones))
             engine.late.assign(late.astype(np.int32))
             engine.change.assign(latency - late * self.control_period)
@@ -231,7 +208,7 @@ class WarpBackend(Backend):
 
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         engine = self._engine
-        with self._scope():
+        with self._exchange.scope():
             self._give("q", q, engine.target)
             if mask is None:
                 engine.mask.fill_(True)
@@ -241,7 +218,7 @@ class WarpBackend(Backend):
         self._fresh = False
 
     def step(self, q_target: Floats) -> SimState:
-        with self._scope():
+        with self._exchange.scope():
             self._give("q_target", q_target, self._engine.target)
             self._engine.step()
         self._fresh = True
@@ -249,34 +226,21 @@ class WarpBackend(Backend):
         self._check_status()
         return state
 
-    def _give(self, name: str, values: Any, array: Any) -> None:
+    def _give(self, name: str, values: Array, array: Any) -> None:
         """Copy values that a caller gives to an array of the engine."""
-        import warp as wp
-
-        if self.arrays == "numpy":
-            if not isinstance(values, np.ndarray):
-                raise self._foreign(name, values)
-            array.assign(values.astype(wp.dtype_to_numpy(array.dtype), copy=False))
-            return
-        import torch
-
-        if not isinstance(values, torch.Tensor) or values.device != torch.device(str(self.device)):
-            raise self._foreign(name, values)
-        own = wp.to_torch(array)
-        own.copy_(values)
-
-    def _foreign(self, name: str, values: Any) -> GymMaraError:
-        own = "arrays of NumPy" if self.arrays == "numpy" else f"tensors of torch on {self.device}"
-        where = f" on {values.device}" if hasattr(values, "device") else ""
-        return GymMaraError(
-            f"{name} is a {type(values).__module__}.{type(values).__name__}{where}; with arrays={self.arrays!r} the backend "
-            f"'warp' takes {own}: convert it with the backend's asarray(values)"
-        )
+        exchange = self._exchange
+        if not exchange.fits(values):
+            where = f" on {values.device}" if hasattr(values, "device") else ""
+            raise GymMaraError(
+                f"{name} is a {type(values).__module__}.{type(values).__name__}{where}; with arrays={self.arrays!r} the "
+                f"backend 'warp' takes {exchange.takes}: convert it with the backend's asarray(values)"
+            )
+        exchange.give(values, array)
 
     @property
     def state(self) -> SimState:
         if not self._fresh:
-            with self._scope():
+            with self._exchange.scope():
                 self._engine.look_at_arms()
             self._fresh = True
         state = self._read()
@@ -285,8 +249,7 @@ class WarpBackend(Backend):
 
     def _read(self) -> SimState:
         """The state in the arrays of the engine."""
-        engine = self._engine
-        read: Callable[[Any], Any] = self._read_tensor if self.arrays == "torch" else _read_numbers
+        engine, read = self._engine, self._exchange.read
         truncates = self.dynamic and self.on_divergence == "truncate"
         common: dict[str, Any] = {
             "q": read(engine.q),
@@ -314,14 +277,6 @@ class WarpBackend(Backend):
             contacts=self._contacts(common["collided"]),
         )
 
-    def _read_tensor(self, array: Any) -> torch.Tensor:
-        """A copy of an array of the engine, on the device."""
-        import warp as wp
-
-        if array.ptr not in self._views:
-            self._views[array.ptr] = wp.to_torch(array)
-        return self._views[array.ptr].clone()
-
     def _contacts(self, collided: Mask) -> tuple[tuple[Contact, ...], ...]:
         """The contacts of each arm in the last control period."""
         if not np.count_nonzero(collided):
@@ -343,7 +298,7 @@ class WarpBackend(Backend):
         status = self._engine.status.numpy()
         if not np.count_nonzero(status):
             return
-        with self._scope():
+        with self._exchange.scope():
             status = self._engine.take_status()
         diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         if lost:
@@ -368,7 +323,7 @@ class WarpBackend(Backend):
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         check_fits("backend", snapshot, self.save())
-        with self._scope():
+        with self._exchange.scope():
             for name, array in self._engine.state.items():
                 array.assign(snapshot[name])
         self._parameters = copy.deepcopy(snapshot["parameters"])
@@ -377,9 +332,3 @@ class WarpBackend(Backend):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return made_again, (type(self), self.robot, self.num_envs, self._settings, self.save())
-
-
-def _read_numbers(array: Any) -> NDArray[Any]:
-    """A copy of an array of the engine, on the host, with numbers in double precision."""
-    values: NDArray[Any] = array.numpy()
-    return values.copy() if values.dtype == np.bool_ else values.astype(np.float64)

@@ -21,7 +21,7 @@ with needs("the backend 'warp'", "warp"):
     import mujoco_warp as mjw
     import warp as wp
 
-    from gym_mara.backends.warp import kernels
+    from gym_mara.backends.warp import kernels, paths
 
 PATH_RESOLUTION = 0.005
 """The longest way of any point of a travelling arm between two checks for collisions, m: that of PinocchioBackend."""
@@ -179,9 +179,9 @@ class Engine:
             with capturing(self.device) as capture:
                 function()
             self._graphs[name] = capture.graph
-        wp.capture_launch(
-            self._graphs[name], stream=wp.get_stream() if self.device.is_cuda else None
-        )
+        stream = wp.get_stream() if self.device.is_cuda else None
+        wp.capture_launch(self._graphs[name], stream=stream)
+        wp.copy(self.status, self._status)
 
     def _step(self, steps: int | None = None) -> None:
         data = self.data
@@ -217,16 +217,14 @@ class Engine:
         """Move along the paths of one period without dynamics, and look for collisions on them."""
         qpos, furthest = self.data.qpos, self._furthest
         path, samples = [self._start_q, self.target], [self._samples, self._stopped]
-        self._over_arms(
-            kernels.plan_path, [*path, furthest, self._reach, PATH_RESOLUTION, *samples]
-        )
+        self._over_arms(paths.plan_path, [*path, furthest, self._reach, PATH_RESOLUTION, *samples])
         for sample in range(1, self._most_samples + 1):
             moved = [self._samples, sample, self._stopped, *self._followers, qpos]
-            self._over_arms(kernels.travel, [*path, furthest, *moved])
+            self._over_arms(paths.travel, [*path, furthest, *moved])
             self._find_contacts()
-            self._over_arms(kernels.stop, [self.hit, self._touching, self._stopped])
+            self._over_arms(paths.stop, [self.hit, self._touching, self._stopped])
         ended = [self.hit, self._stopped, qpos, self.data.qvel, self._touching, self.steps]
-        self._over_arms(kernels.arrive, [*path, self._velocity, *ended])
+        self._over_arms(paths.arrive, [*path, self._velocity, *ended])
 
     def put_at_rest(self) -> None:
         """Put the arms of `mask` at rest at `target`."""
@@ -259,7 +257,6 @@ class Engine:
         state = [self.q, self.qd, self.position, self.quaternion, self.velocity]
         arguments = [*moved, *self._end_effector, *bodies, *known, *state, self.collided, self.time]
         self._over_arms(kernels.report, arguments)
-        wp.copy(self.status, self._status)
 
     def take_status(self) -> NDArray[np.int32]:
         """Wait for the device, and return what `status` tells then, which is forgotten."""

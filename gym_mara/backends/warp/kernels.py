@@ -1,4 +1,4 @@
-"""Warp's kernels around those of MuJoCo Warp: servos, paths, contacts, resets, and the report of a state.
+"""Warp's kernels around those of MuJoCo Warp: servos, contacts, resets, and the report of a state.
 
 N is the number of arms, J that of the robot's joints, F that of the joints that follow others, D that of the latest targets. Positions of MuJoCo's joints
 (N, J + F) begin with those of the robot. All lengths are in m, angles in rad, times in s.
@@ -26,7 +26,6 @@ _LOST = wp.constant(LOST)
 _NO_CONTACT = wp.constant(NO_CONTACT)
 _DIVERGED_VELOCITY = wp.constant(DIVERGED_VELOCITY)
 _ZERO = wp.constant(ZERO)
-_ROUNDING = wp.constant(1e-6)
 
 
 @wp.func
@@ -196,7 +195,7 @@ def judge(
 
 
 @wp.func
-def _place(
+def place_followers(
     qpos: wp.array2d[float],
     arm: int,
     joints: int,
@@ -207,86 +206,6 @@ def _place(
     """Put the joints that follow others where they belong."""
     for index in range(leader.shape[0]):
         qpos[arm, joints + index] = multiplier[index] * qpos[arm, leader[index]] + offset[index]
-
-
-@wp.kernel(enable_backward=False)
-def plan_path(
-    start_q: wp.array2d[float],
-    target: wp.array2d[float],
-    furthest: wp.array[float],
-    reach: wp.array[float],
-    resolution: float,
-    samples: wp.array[int],
-    stopped: wp.array[int],
-):
-    """In how many samples each arm's path of one control period is checked for collisions."""
-    arm = wp.tid()
-    length = float(0.0)
-    for joint in range(furthest.shape[0]):
-        way = wp.abs(target[arm, joint] - start_q[arm, joint])
-        length += wp.min(way, furthest[joint]) * reach[joint]
-    samples[arm] = wp.max(1, int(wp.ceil(length / resolution)))
-    stopped[arm] = 0
-
-
-@wp.kernel(enable_backward=False)
-def travel(
-    start_q: wp.array2d[float],
-    target: wp.array2d[float],
-    furthest: wp.array[float],
-    samples: wp.array[int],
-    sample: int,
-    stopped: wp.array[int],
-    leader: wp.array[int],
-    multiplier: wp.array[float],
-    offset: wp.array[float],
-    qpos: wp.array2d[float],
-):
-    """Move each arm to a sample of its path, or to its end; one that stopped stays."""
-    arm = wp.tid()
-    if stopped[arm] != 0:
-        return
-    part = float(wp.min(sample, samples[arm])) / float(samples[arm])
-    for joint in range(furthest.shape[0]):
-        way = target[arm, joint] - start_q[arm, joint]
-        most = furthest[joint] * part
-        if wp.abs(way) <= most * (1.0 + _ROUNDING):
-            qpos[arm, joint] = target[arm, joint]  # exactly, without rounding
-        else:
-            qpos[arm, joint] = start_q[arm, joint] + wp.clamp(way, -most, most)
-    _place(qpos, arm, furthest.shape[0], leader, multiplier, offset)
-
-
-@wp.kernel(enable_backward=False)
-def stop(hit: wp.array[int], touching: wp.array[int], stopped: wp.array[int]):
-    """Stop the arms that collide and did not touch anything before."""
-    arm = wp.tid()
-    if hit[arm] != 0 and touching[arm] == 0:
-        stopped[arm] = 1
-
-
-@wp.kernel(enable_backward=False)
-def arrive(
-    start_q: wp.array2d[float],
-    target: wp.array2d[float],
-    velocity: wp.array[float],
-    hit: wp.array[int],
-    stopped: wp.array[int],
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    touching: wp.array[int],
-    steps: wp.array[int],
-):
-    """End a control period without dynamics: the velocities after it."""
-    arm = wp.tid()
-    steps[arm] = steps[arm] + 1
-    touching[arm] = hit[arm]
-    for joint in range(velocity.shape[0]):
-        way = target[arm, joint] - start_q[arm, joint]
-        if stopped[arm] != 0 or qpos[arm, joint] == target[arm, joint]:
-            qvel[arm, joint] = 0.0
-        else:
-            qvel[arm, joint] = wp.sign(way) * velocity[joint]
 
 
 @wp.kernel(enable_backward=False)
@@ -317,7 +236,7 @@ def put_at_rest(
         torque[arm, joint] = 0.0
         for index in range(targets.shape[1]):
             targets[arm, index, joint] = q[arm, joint]
-    _place(qpos, arm, q.shape[1], leader, multiplier, offset)
+    place_followers(qpos, arm, q.shape[1], leader, multiplier, offset)
     for joint in range(qvel.shape[1]):
         qvel[arm, joint] = 0.0
         warmstart[arm, joint] = 0.0
