@@ -26,6 +26,18 @@ from gym_mara.types import Floats, Mask, UnitActions
 _KNOWN_WRAPPERS = (OrderEnforcing, PassiveEnvChecker, RescaleAction, TimeLimit, Monitor)
 
 
+def require_numpy(env: MaraVectorEnv) -> None:
+    """Check that an environment takes and gives NumPy's arrays, as Stable-Baselines3 does.
+
+    Raises:
+        GymMaraError: it takes and gives tensors.
+    """
+    if (arrays := env.simulation.backend.arrays) != "numpy":
+        raise GymMaraError(
+            f"Stable-Baselines3 and the policies of runs take NumPy's arrays: leave out arrays={arrays!r}"
+        )
+
+
 class MaraVecEnv(VecEnv):
     """N arms for Stable-Baselines3. Actions are joint targets, rad, or are scaled to them as `RescaleAction` does.
 
@@ -38,10 +50,11 @@ class MaraVecEnv(VecEnv):
             environment; by default the space of the environment, which is not scaled.
 
     Raises:
-        GymMaraError: the environment has another autoreset mode, or the space has another shape or no bounds.
+        GymMaraError: the environment has another autoreset mode or tensors, or the space has another shape or no bounds.
     """
 
     def __init__(self, env: MaraVectorEnv, action_space: Box | None = None) -> None:
+        require_numpy(env)
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise GymMaraError(
                 "Stable-Baselines3 needs episodes that are reset in the same step: pass autoreset_mode='SameStep'"

@@ -118,6 +118,13 @@ def test_it_takes_what_make_vec_makes() -> None:
     PPO("MlpPolicy", MaraVecEnv(made), n_steps=8, batch_size=16, device="cpu").learn(16)
 
 
+def test_an_environment_of_tensors_is_refused() -> None:
+    env = MaraVectorEnv(1, autoreset_mode="SameStep")
+    env.simulation.backend.arrays = "torch"
+    with pytest.raises(GymMaraError, match="take NumPy's arrays: leave out arrays='torch'"):
+        MaraVecEnv(env)
+
+
 def test_another_autoreset_mode_is_refused() -> None:
     with pytest.raises(GymMaraError, match="SameStep"):
         MaraVecEnv(MaraVectorEnv(2))

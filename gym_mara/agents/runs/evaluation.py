@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from gym_mara.agents.runs.config import check_options
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.runs.policy import load_policy
-from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.sb3 import MaraVecEnv, require_numpy
 from gym_mara.agents.scaling import unit_box
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
@@ -37,9 +37,11 @@ def make_arms(
     workers = options.get("workers")
     if type(workers) is int and workers > 0:
         options = {**options, "workers": math.gcd(workers, num_envs)}
-    return make_vector_env(
+    arms = make_vector_env(
         env, num_envs, backend=backend, autoreset_mode="SameStep", **limit, **options
     )
+    require_numpy(arms)
+    return arms
 
 
 def make_env(
