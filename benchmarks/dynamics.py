@@ -10,7 +10,8 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from speed import PEERS, batch, rates, row, single
+from speed import PEERS, batch, single
+from timing import rates, row
 
 import gym_mara  # noqa: F401 - registers the environments
 from gym_mara.backends.dart.arm import DartArm
