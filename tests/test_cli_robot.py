@@ -9,6 +9,7 @@ from typing import Any
 import imageio.v3 as imageio
 import pytest
 
+from gym_mara.backends import backend_names
 from gym_mara.robot import RobotModel
 from tests.helpers import Cli, write
 from tests.robot.arms import FOLDED, LIMIT, TOOL, UPRIGHT_REACH, arm, arm_file
@@ -47,10 +48,10 @@ def test_the_json_has_the_same(gym_mara: Cli, tmp_path: Path) -> None:
     }
     assert found["reach"] == pytest.approx(UPRIGHT_REACH - 0.02, abs=1e-3)
     assert found["pairs"]["checked"] == [["base", "l2"], ["base", "l3"], ["l1", "l3"]]
-    assert found["backends"] == {"dart": None, "pinocchio": None}
+    assert found["backends"] == dict.fromkeys(backend_names())
 
 
-@pytest.mark.parametrize(("backend", "code"), [("dart", 1), ("pinocchio", 0), (None, 0)], ids=str)
+@pytest.mark.parametrize(("backend", "code"), [("dart", 1), ("mujoco", 1), ("pinocchio", 0), (None, 0)], ids=str)
 def test_the_exit_code_says_whether_the_arm_works_on_the_backend(
     gym_mara: Cli, tmp_path: Path, backend: str | None, code: int
 ) -> None:

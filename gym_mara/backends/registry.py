@@ -22,6 +22,7 @@ _GROUP = "gym_mara.backends"
 _BACKENDS = {
     "pinocchio": "gym_mara.backends.pinocchio:PinocchioBackend",
     "dart": "gym_mara.backends.dart:DartBackend",
+    "mujoco": "gym_mara.backends.mujoco:MujocoBackend",
 }
 
 

@@ -50,14 +50,15 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
                 f"workers={workers} must divide the number of arms, {num_envs}: {', '.join(fitting)}"
             )
         return workers
-    if multiprocessing.parent_process() is not None or _in_ray_worker():
+    if in_worker():
         return 1
     return max(n for n in range(1, len(cores()) + 1) if num_envs % n == 0)
 
 
-def _in_ray_worker() -> bool:
+def in_worker() -> bool:
+    """Whether multiprocessing or Ray has started this process."""
     ray = sys.modules.get("ray")
-    return (
+    return multiprocessing.parent_process() is not None or (
         ray is not None
         and ray.is_initialized()
         and ray.get_runtime_context().get_task_id() is not None

@@ -71,7 +71,10 @@ CASES = {
         f"pinocchio, travelling, {robot}": Case("pinocchio", TRAVELLING, robot)
         for robot in OTHER_ROBOTS
     },
+    "mujoco, threads": Case("mujoco", {"threads": 2}),
+    "mujoco, random": Case("mujoco", {"randomisation": RANDOM, "on_divergence": "truncate"}),
     **{f"dart, {robot}": Case("dart", {"workers": 1}, robot) for robot in OTHER_ROBOTS},
+    **{f"mujoco, {robot}": Case("mujoco", {}, robot) for robot in OTHER_ROBOTS},
 }
 
 

@@ -11,6 +11,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
 from gym_mara.robot.description.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from gym_mara.types import Floats
 
 with needs("the backend 'mujoco'", "mujoco"):
     import mujoco
@@ -34,7 +35,9 @@ def build_model(robot: RobotModel, physics_step: float, *, shafts: bool = True) 
         robot: the arm.
         physics_step: s.
         shafts: whether the shafts are part of the model, with an actuator each, whose control is the velocity, rad/s (m/s).
-            Without them whoever steps the model writes the velocities into the constraints.
+            Then a sensor for each of `link_pairs` gives the pair's smallest distance, m: negative in contact, else 0.
+            Without shafts whoever steps the model writes the velocities into the constraints, and one sensor counts the
+            contacts.
 
     Raises:
         GymMaraError: MuJoCo cannot load it.
@@ -55,9 +58,7 @@ def build_model(robot: RobotModel, physics_step: float, *, shafts: bool = True) 
     _add_links(spec, robot, bodies)
     for number in range(1, robot.num_joints + 1):
         _add_motor(spec, robot, number, shafts)
-    # Its one number is that of the contacts.
-    contact = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "name": "contacts"}
-    spec.add_sensor(**contact).intprm = [1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1]
+    _add_contact_sensors(spec, robot, pairs=shafts)
     try:
         model = spec.compile()
     except ValueError as error:
@@ -65,6 +66,44 @@ def build_model(robot: RobotModel, physics_step: float, *, shafts: bool = True) 
     # Here it is one number per joint in every version of MuJoCo; in MjSpec it is not.
     model.dof_damping[: robot.num_joints] = robot.model.damping
     return model
+
+
+def set_parameters(
+    model: mujoco.MjModel,
+    nominal: mujoco.MjModel,
+    mass: Floats | None = None,
+    effort_limit: Floats | None = None,
+    joint_friction: Floats | None = None,
+    contact_friction: Floats | None = None,
+) -> None:
+    """Set the physical parameters in which an arm's own model differs from the nominal one; None for the nominal value.
+
+    Args:
+        model: the arm's own.
+        nominal: that of the robot.
+        mass: scale of the mass and inertia of each joint's body (J,).
+        effort_limit: scale of each motor's effort limit (J,).
+        joint_friction: Coulomb friction of each joint (J,), Nm (N).
+        contact_friction: coefficient of friction of all surfaces ().
+    """
+    if effort_limit is not None:
+        model.tendon_frictionloss[:] = np.maximum(
+            effort_limit * nominal.tendon_frictionloss, mujoco.mjMINVAL
+        )
+    if joint_friction is not None:
+        model.dof_frictionloss[: len(joint_friction)] = joint_friction
+    if contact_friction is not None:
+        model.geom_friction[:, 0] = contact_friction
+    if mass is not None:
+        bodies = nominal.jnt_bodyid[: len(mass)]
+        model.body_mass[bodies] = mass * nominal.body_mass[bodies]
+        model.body_inertia[bodies] = mass[:, None] * nominal.body_inertia[bodies]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def link_pairs(robot: RobotModel) -> list[tuple[str, str]]:
+    """The pairs of links that may collide, each in alphabetical order, in the order of the sensors."""
+    return sorted((min(pair), max(pair)) for pair in robot.collision_pairs)
 
 
 def link_of_geoms(robot: RobotModel, model: mujoco.MjModel) -> list[str]:
@@ -152,6 +191,28 @@ def _add_links(spec: Any, robot: RobotModel, bodies: list[Any]) -> None:
                 spec.add_exclude(bodyname1=links[one].name, bodyname2=links[other].name)
 
 
+def _add_contact_sensors(spec: Any, robot: RobotModel, *, pairs: bool) -> None:
+    """Add a sensor of the smallest distance for each pair of links, or one sensor that counts all contacts.
+
+    Both see the state at the beginning of a step.
+    """
+    kind, fields = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtConDataField
+    if not pairs:
+        sensor = spec.add_sensor(type=kind, name="contacts")
+        sensor.intprm = [1 << fields.mjCONDATA_FOUND.value, 0, 1]
+        return
+    body, nearest = mujoco.mjtObj.mjOBJ_BODY, 1
+    for one, other in link_pairs(robot):
+        sensor = spec.add_sensor(
+            type=kind,
+            objtype=body,
+            objname=f"link {one}",
+            reftype=body,
+            refname=f"link {other}",
+        )
+        sensor.intprm = [1 << fields.mjCONDATA_DIST.value, nearest, 1]
+
+
 def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape) -> None:
     """Add a shape where Pinocchio's geometry object is."""
     kinds, options = mujoco.mjtGeom, dict[str, Any]()
@@ -167,7 +228,7 @@ def _add_shape(spec: Any, body: Any, geometry: pin.GeometryObject, shape: Shape)
         case Mesh() as mesh:
             spec.add_mesh(
                 name=geometry.name,
-                uservert=mesh.vertices.ravel(),
+                uservert=mesh.hull.vertices.ravel(),
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,  # unused, but MuJoCo computes one
             )
             options = {"type": kinds.mjGEOM_MESH, "meshname": geometry.name}
