@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+"""Real numbers. With a backend whose `arrays` are "torch", tensors stand in their place, and in that of every Mask."""
 Mask = NDArray[np.bool_]
 """One flag per arm (N,), unless stated otherwise."""
+Array = Any
+"""An array of NumPy or a tensor of torch: for functions of both, which no type describes (`gym_mara.arrays`)."""
 
 
 class UnitActions(np.ndarray[Any, np.dtype[np.float32]]):

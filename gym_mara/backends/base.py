@@ -6,12 +6,12 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
-from gym_mara.types import Floats, Mask
+from gym_mara.types import Array, Floats, Mask
 
 
 class Backend(ABC):
@@ -25,10 +25,12 @@ class Backend(ABC):
 
     in_processes: ClassVar[bool] = False
     """Whether many arms run faster in several processes: true for an engine that holds Python's lock while it steps."""
-    dynamic: ClassVar[bool] = False
+    dynamic: bool = False
     """Whether masses and forces count, so that the robot's must be right."""
     most_arms: ClassVar[int] = 2**20
     """The largest number of arms: with more, an ordinary machine runs out of memory."""
+    precision: ClassVar[type[np.floating[Any]]] = np.float64
+    """The floating-point type in which the engine computes; states are in double precision all the same."""
     teleports: bool = False
     """Whether the joints reach their targets within a step, whatever the distance."""
     random: bool = False
@@ -39,6 +41,12 @@ class Backend(ABC):
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float
     """How long one step lasts, s."""
+    arrays: str = "numpy"
+    """The library of the arrays that `reset` and `step` take, and of those in the states: "numpy", or "torch" for tensors.
+
+    With tensors `contacts` is None. The other methods and attributes keep NumPy's arrays, snapshots too."""
+    device: str | None = None
+    """The device of the tensors in the names of torch, such as "cuda:0"; None with NumPy's arrays."""
 
     def __init__(self, robot: RobotModel, num_envs: int, *, control_period: float = 0.02) -> None:
         if self.dynamic:
@@ -54,6 +62,14 @@ class Backend(ABC):
             reason="no arm is controlled at others",
         )
         self.joint_velocity = robot.velocity_limit
+
+    def asarray(self, values: ArrayLike) -> Array:
+        """Values of the host as an array for this backend: flags stay flags, numbers become its floats.
+
+        A backend of tensors overrides this method.
+        """
+        array = np.asarray(values)
+        return array if array.dtype == np.bool_ else array.astype(np.float64, copy=False)
 
     @abstractmethod
     def reset(self, q: Floats, mask: Mask | None = None) -> None:

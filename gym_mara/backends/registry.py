@@ -23,6 +23,7 @@ _BACKENDS = {
     "pinocchio": "gym_mara.backends.pinocchio:PinocchioBackend",
     "dart": "gym_mara.backends.dart:DartBackend",
     "mujoco": "gym_mara.backends.mujoco:MujocoBackend",
+    "warp": "gym_mara.backends.warp:WarpBackend",
 }
 
 

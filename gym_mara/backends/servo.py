@@ -200,10 +200,7 @@ class ServoBackend(Backend):
             self._rebuild(arm, self._q[arm], self._qd[arm])
         if self.on_divergence == "error":
             first = int(diverged.argmax())
-            raise SimulationDivergedError(
-                f"the simulation of arm {first} diverged {self._time[first]:.3f} s after its reset; a shorter "
-                "physics_step may help, or on_divergence='truncate' to end such episodes"
-            )
+            raise simulation_diverged(first, self._time[first])
 
     @property
     def state(self) -> SimState:
@@ -239,16 +236,25 @@ class ServoBackend(Backend):
             self._apply_parameters(arm)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), self.robot, self.num_envs, self._settings, self.save())
+        return made_again, (type(self), self.robot, self.num_envs, self._settings, self.save())
 
 
-def _restored(
+def simulation_diverged(arm: int, time: float) -> SimulationDivergedError:
+    """The error for an arm whose state diverged at this time after its reset, s."""
+    return SimulationDivergedError(
+        f"the simulation of arm {arm} diverged {time:.3f} s after its reset; a shorter physics_step may help, or "
+        "on_divergence='truncate' to end such episodes"
+    )
+
+
+def made_again(
     backend: type[Backend],
     robot: RobotModel,
     num_envs: int,
     settings: dict[str, Any],
     snapshot: dict[str, Any],
 ) -> Backend:
+    """A backend with the state of a snapshot, for pickle and copy."""
     made = backend(robot, num_envs, **settings)
     made.restore(snapshot)
     return made

@@ -56,10 +56,16 @@ RANDOM = {
     "sensor_noise": (0.0, 1e-3),
 }
 TRAVELLING = {"max_joint_velocity": 1.0}
+# Two physics steps, because each takes long on a CPU; and room for arms that random poses put deep into the table.
+WARP = {"device": "cpu", "physics_step": 0.004, "max_contacts": 96}
 OTHER_ROBOTS = ("3 joints", "7 joints", "rail")
 CASES = {
     **{name: Case(name) for name in backend_names()},
     "fake": Case("fake"),
+    "warp": Case("warp", WARP),
+    "warp, kinematic": Case("warp", WARP | {"dynamics": False}),
+    "warp, travelling": Case("warp", WARP | TRAVELLING | {"dynamics": False}),
+    "warp, rail": Case("warp", WARP, "rail"),
     "pinocchio, travelling": Case("pinocchio", TRAVELLING),
     "pinocchio, fcl": Case("pinocchio", {"collision": "fcl"}),
     "pinocchio, threads": Case("pinocchio", {"collision_threads": 2}),

@@ -122,7 +122,7 @@ def _add_joint(spec: Any, robot: RobotModel, number: int, parent: Any) -> Any:
     """Add a joint of Pinocchio's model, its end stops or what it follows, and the body that it carries; returns the body."""
     name, inertia = robot.model.names[number], robot.model.inertias[number]
     follows = number > robot.num_joints
-    if follows and inertia.mass <= 0.0:
+    if inertia.mass <= 0.0:  # one that counts is refused earlier
         inertia = _NO_INERTIA
     body = _add_body(parent, inertia, **_placed(robot.model.jointPlacements[number]))
     linear, angular = np.split(robot.motion(number), 2)
