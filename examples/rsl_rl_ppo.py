@@ -40,13 +40,14 @@ class RslRlEnv(VecEnv):  # type: ignore[misc]
     """A MaraVectorEnv with tensors as RSL-RL's VecEnv. Actions from -1 to 1 are scaled to the action space."""
 
     def __init__(self, env: MaraVectorEnv) -> None:
-        self.env, self.cfg = env, {}
+        self.env: Any = env
+        self.cfg: dict[str, Any] = {}
         self.num_envs = env.num_envs
         self.num_actions = env.simulation.robot.num_joints
         self.max_episode_length = env.max_episode_steps or 0
         self.observation, self.info = env.reset(seed=0)
         self.device = self.observation.device
-        self._bound = torch.as_tensor(env.single_action_space.high, device=self.device)
+        self._bound = torch.as_tensor(env.simulation.action_space.high, device=self.device)
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
