@@ -39,7 +39,7 @@ TASK = "MARACollision-v0"
 ARMS = (1024, 8192, 32768, 65536)
 TRAVELLING = {"max_joint_velocity": 1.57}
 LIBRARIES = ("gymnasium", "numpy", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
-PER_ARMS = ("dynamics", "kinematics", "travelling")
+AT_EACH, AT_ONE = ("dynamics", "kinematics"), ("dynamics in contact", "travelling")
 RATE, BARE, RATIO = "steps/s", "bare CUDA graph, steps/s", "relative to the bare graph"
 MEMORY, START = "device memory, MB", "from the start to the first step, s"
 CONTACTS = "points of contact an arm"
@@ -50,7 +50,7 @@ TARGETS = {
     ("training", 8192, RATE): "at least 250,000",
 }
 ACTIONS = 10
-"""How many random actions a turn takes; nobody waits for the GPU within one."""
+"""How many steps a turn has; nobody waits for the GPU within one."""
 
 Results = Iterator[tuple[str, float]]
 
@@ -73,17 +73,17 @@ def memory(device: str) -> float:
     return (total - free) / 1e6
 
 
-def steps_of(env: MaraVectorEnv, device: str) -> Callable[[], int]:
-    """Steps of the environment with random actions, which are tensors on the device."""
+def steps_of(env: MaraVectorEnv, device: str, actions: int = ACTIONS) -> Callable[[], int]:
+    """Steps of the environment with so many random actions in turn, which are tensors on the device."""
     rng = np.random.default_rng(0)
     low, high = env.simulation.action_space.low, env.simulation.action_space.high
     shape = (env.num_envs, len(low))
     asarray = env.simulation.backend.asarray
-    actions = [asarray(rng.uniform(low, high, shape)) for _ in range(ACTIONS)]
+    drawn = [asarray(rng.uniform(low, high, shape)) for _ in range(actions)]
 
     def run() -> int:
-        for action in actions:
-            env.step(action)
+        for index in range(ACTIONS):
+            env.step(drawn[index % actions])
         wait(device)
         return ACTIONS * env.num_envs
 
@@ -123,6 +123,11 @@ def bare_steps(env: MaraVectorEnv, device: str) -> Callable[[], int]:
     return run
 
 
+def points_of_contact(env: Any) -> float:
+    """The points of contact at the end of the last step, of an arm on average."""
+    return float(env.simulation.backend._engine.data.nacon.numpy()[0]) / env.num_envs
+
+
 def make(arms: int, device: str, **options: Any) -> MaraVectorEnv:
     """The arms, with tensors on the device."""
     options |= {"backend": "warp", "arrays": "torch", "device": device}
@@ -148,12 +153,23 @@ def dynamics(arms: int, device: str, seconds: float) -> Results:
     run = steps_of(env, device)
     run()
     yield MEMORY, memory(device) - before
-    yield CONTACTS, float(env.simulation.backend._engine.data.nacon.numpy()[0]) / arms  # type: ignore[attr-defined]
+    yield CONTACTS, points_of_contact(env)
     alone = rates({RATE: run}, seconds)
     yield RATE, alone[RATE]
     measured = rates({RATE: run, BARE: bare_steps(env, device)}, seconds)
     yield BARE, measured[BARE]
     yield RATIO, measured[RATE] / measured[BARE]
+
+
+def in_contact(arms: int, device: str, seconds: float) -> Results:
+    """The same with arms that stay in contact: each keeps one random target, and is not reset."""
+    env = make(arms, device, on_collision="continue")
+    env.reset(seed=0)
+    run = steps_of(env, device, 1)
+    for _ in range(10):  # for two seconds of simulation, until they are there
+        run()
+    yield CONTACTS, points_of_contact(env)
+    yield RATE, rates({RATE: run}, seconds)[RATE]
 
 
 def kinematics(arms: int, device: str, seconds: float, **options: Any) -> Results:
@@ -189,6 +205,7 @@ def training(arms: int, device: str, seconds: float) -> Results:
 MEASURES: dict[str, Callable[[int, str, float], Results]] = {
     "start": start,
     "dynamics": dynamics,
+    "dynamics in contact": in_contact,
     "kinematics": kinematics,
     "travelling": travelling,
     "training": training,
@@ -267,7 +284,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="how long a speed is measured")
     parser.add_argument("--timeout", type=float, default=240.0, help="of one measurement, s")
     parser.add_argument("--out", type=Path, help="a file for the same text")
-    parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
+    parser.add_argument("--measure", help=argparse.SUPPRESS)
     options = parser.parse_args()
     try:
         check(options.device)
@@ -294,7 +311,8 @@ def report(options: argparse.Namespace) -> Iterator[str]:
     first = options.arms[0]
     rows = [("start", "start, kernels are compiled", first)]
     rows += [("start", "start, kernels come from the cache", first)]
-    rows += [(name, name, arms) for name in PER_ARMS for arms in options.arms]
+    rows += [(name, name, arms) for name in AT_EACH for arms in options.arms]
+    rows += [(name, name, options.arms[-2:][0]) for name in AT_ONE]
     rows += [("training", "training", options.training_arms)]
     used: dict[int, float] = {}
     for name, label, arms in rows:

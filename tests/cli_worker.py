@@ -83,11 +83,10 @@ def _work(pipe: Connection) -> None:
 
 def _prepare() -> None:
     """Import what the commands import, and replace what would start processes or wait for a user."""
-    from gym_mara import tasks
-
-    tasks.MAX_EPISODE_STEPS = _EPISODE_STEPS  # before another module imports it
-
-    from gym_mara import cli  # noqa: F401
+    from gym_mara import (
+        cli,  # noqa: F401
+        registration,
+    )
     from gym_mara.agents.experiments import figures, local_executor, search  # noqa: F401
     from gym_mara.agents.experiments.executor import Job, OnMessage, failure_of
     from gym_mara.agents.inspection import report
@@ -101,6 +100,8 @@ def _prepare() -> None:
     def interrupted(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
+    for name, environment in registration.ENVIRONMENTS.items():
+        registration.ENVIRONMENTS[name] = environment._replace(max_episode_steps=_EPISODE_STEPS)
     vars(local_executor)["run_in_processes"] = vars(search)["run_in_processes"] = run_here
     vars(report)["_VIDEO_SECONDS"] = 0.1
     setattr(Viewer, "run", interrupted)  # noqa: B010

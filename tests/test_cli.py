@@ -70,9 +70,18 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "4096", "--out", run)
     assert code == 0
     assert "position error, mm" in out
-    code, out, _ = gym_mara("transfer", run)
+    everywhere = ("--backend", "dart,mujoco,pinocchio")
+    code, out, _ = gym_mara("transfer", run, *everywhere)
     assert code == 0
-    assert all(word in out for word in ("dart", "pinocchio", "settling time", "highest torque"))
+    assert all(word in out for word in ("mujoco", "pinocchio", "settling time", "highest torque"))
+    code, out, _ = gym_mara("transfer", run, *everywhere, "--json")
+    assert code == 0
+    rows = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
+    assert [row["backend"] for row in rows] == ["dart", "mujoco", "pinocchio", "pinocchio"]
+    assert rows[3]["settings"] == {"max_joint_velocity": 1.57}
+    assert rows[1]["highest_torque"]["mean"] > 0.0
+    assert rows[2]["highest_torque"] is None
+    assert rows[0]["position_error_mm"].keys() == {"mean", "std", "min", "max"}
     code, out, _ = gym_mara("evaluate", run, "--episodes", "2", "--json", "--policy", "best")
     assert code == 0
     metrics = json.loads(out)
@@ -90,7 +99,7 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     away = ("--set", "target_position=[0.1, 0.3, 0.9]")
     _, moved, _ = gym_mara("evaluate", run, *away)
     assert moved != out
-    _, compared, _ = gym_mara("transfer", run, *away)
+    _, compared, _ = gym_mara("transfer", run, "--backend", "pinocchio", *away)
     assert compared.split("position error, mm")[1].split()[1] in moved
     code, _, err = gym_mara("train", "--out", run)
     assert code == 2

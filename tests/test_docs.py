@@ -85,6 +85,17 @@ def test_the_readme_says_beside_make_vec_how_stable_baselines3_takes_it() -> Non
     assert "MaraVecEnv" in "".join(lines[place : place + 2])
 
 
+def test_the_page_on_backends_shows_the_example_package() -> None:
+    page = (ROOT / "docs" / "add_a_backend.md").read_text(encoding="utf-8")
+    package = ROOT / "examples" / "lag_backend"
+    blocks = re.findall(r"^```(?:python|toml)\n(.*?)^```", page, re.M | re.S)
+    assert (package / "gym_mara_lag.py").read_text(encoding="utf-8") in blocks
+    assert (package / "pyproject.toml").read_text(encoding="utf-8") in blocks
+    [contract] = [block for block in blocks if "BackendContract" in block]
+    tests = (package / "test_gym_mara_lag.py").read_text(encoding="utf-8")
+    assert contract[contract.index("THREE_JOINTS") :].rstrip() in tests
+
+
 def test_each_side_of_the_film_of_both_backends_has_its_name() -> None:
     with Image.open(ROOT / "docs" / "media" / "both_backends.gif") as film:
         picture = np.asarray(film.convert("L"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -76,17 +77,21 @@ def test_the_zoo_knows_the_papers_four_environments(algo: str) -> None:
 def test_a_backend_from_another_package_passes_the_contract(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package, site = tmp_path / "mujoco_backend", tmp_path / "site"
-    shutil.copytree(EXAMPLES / "mujoco_backend", package)  # building leaves files in the source
+    package, site = tmp_path / "lag_backend", tmp_path / "site"
+    shutil.copytree(EXAMPLES / "lag_backend", package)  # building leaves files in the source
     pip = "-m pip install -q --no-deps --no-build-isolation --disable-pip-version-check --target"
     _run(*pip.split(), str(site), str(package), cwd=tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(site))
-    assert "mujoco" in _run("-m", "gym_mara.cli", "list", cwd=tmp_path)
-    train = "train --env MARA-v0 --backend mujoco --steps 512 --out run"
+    assert "lag" in _run("-m", "gym_mara.cli", "list", cwd=tmp_path)
+    train = "train --env MARA-v0 --backend lag --steps 512 --out run"
     _run("-m", "gym_mara.cli", *train.split(), cwd=tmp_path)
-    assert " passed" in _run(
-        "-m", "pytest", "-q", "-p", "no:cacheprovider", str(package), cwd=tmp_path
-    )
+    page = (EXAMPLES.parent / "docs" / "add_a_backend.md").read_text(encoding="utf-8")
+    [script] = [
+        b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "gymnasium.make(" in b
+    ]
+    _run("-c", script, cwd=tmp_path)
+    tests = ("-m", "pytest", "-q", "-p", "no:cacheprovider", str(package))
+    assert " passed" in _run(*tests, cwd=tmp_path)
 
 
 def _done(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -7,6 +7,7 @@ from gym_mara.backends.registry import (
     backend_settings,
     installed_backends,
     make_backend,
+    usable_backends,
 )
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "backend_settings",
     "installed_backends",
     "make_backend",
+    "usable_backends",
 ]

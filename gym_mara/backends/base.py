@@ -71,6 +71,14 @@ class Backend(ABC):
         array = np.asarray(values)
         return array if array.dtype == np.bool_ else array.astype(np.float64, copy=False)
 
+    @classmethod  # noqa: B027 - most need nothing special
+    def require_machine(cls) -> None:
+        """Check that this machine has what the engine needs unless its settings say otherwise, such as a GPU.
+
+        Raises:
+            GymMaraError: it has not.
+        """
+
     @abstractmethod
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         """Put all arms, or those of the mask (N,), at rest at their rows of q (N, J), rad, and set their time to zero."""

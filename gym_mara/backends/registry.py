@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -86,14 +87,24 @@ def backend_settings(name: str) -> list[str]:
 
 def installed_backends() -> tuple[list[str], list[str]]:
     """The names of the backends that can be imported here, and for each of the others the reason why not."""
-    installed, reasons = [], []
+    return _those_that(backend_class)
+
+
+def usable_backends() -> tuple[list[str], list[str]]:
+    """The names of the backends that work on this machine by default, and for each of the others the reason why not."""
+    return _those_that(lambda name: backend_class(name).require_machine())
+
+
+def _those_that(check: Callable[[str], object]) -> tuple[list[str], list[str]]:
+    """The names of the backends that pass a check, and the errors of the others."""
+    passed, reasons = [], []
     for name in backend_names():
         try:
-            backend_class(name)
-            installed.append(name)
+            check(name)
+            passed.append(name)
         except GymMaraError as error:
             reasons.append(str(error))
-    return installed, reasons
+    return passed, reasons
 
 
 def make_backend(

@@ -26,11 +26,14 @@ from gym_mara.cli.common import (
     RunBackendOption,
     SetOption,
     StepsOption,
+    backend_name,
     interruptible,
     keyword_arguments,
+    names_in,
     needs_agents,
     out,
     refuse,
+    several,
     whole,
 )
 from gym_mara.errors import GymMaraError
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from gym_mara.agents.runs.folder import RunFolder
 
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
 EpisodesOption = Annotated[
     int,
     typer.Option(
@@ -53,6 +57,9 @@ _UNITS = {
     "reward_per_step": "reward per step",
     "return": "return",
     "collisions": "collisions",
+    "settling_time_s": "settling time, s",
+    "highest_torque": "highest torque / limit",
+    "highest_velocity": "highest speed, rad/s",
 }
 
 
@@ -129,7 +136,7 @@ def evaluate(
     episodes: EpisodesOption = 10,
     policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Play a run's deterministic policy: position error and angle at the last step, reward, collisions.
 
@@ -152,31 +159,41 @@ def evaluate(
 
 def transfer(
     run: RunArgument,
+    backend: Annotated[
+        list[str],
+        typer.Option(
+            parser=several(backend_name),
+            metavar="NAMES",
+            help="Backends to play on, separated by commas; by default all that work on this machine.",
+        ),
+    ] = [],  # noqa: B006 - Typer reads it and never changes it
     episodes: EpisodesOption = 1,
     policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+    as_json: JsonOption = False,
 ) -> None:
-    """Play a run's policy on every installed backend, and compare the results. Needs the extra train."""
+    """Play a run's policy on several backends, and compare the results. Needs the extra train."""
     with needs_agents():
         from gym_mara.agents.inspection.transfer import transfer as play_on_all
+        from gym_mara.agents.runs.evaluation import spread
         from gym_mara.agents.runs.folder import RunFolder
 
-    options = keyword_arguments(settings)
+    options, names = keyword_arguments(settings), names_in("--backend", backend)
     folder = RunFolder.open(run)
-    rows = play_on_all(folder, episodes=episodes, which=policy, options=options)
-    names = (
-        "position error, mm",
-        "angle, deg",
-        "return",
-        "collisions",
-        "settling time, s",
-        "highest torque / limit",
-        "highest speed, rad/s",
-    )
-    titles = [Column(row.backend.replace(", ", ",\n"), justify="right") for row in rows]
-    table = Table("", *titles, title=", ".join([folder.config.env, f"{policy} policy", *settings]))
-    for index, name in enumerate(names, start=1):
-        table.add_row(name, *(_mean_and_spread(np.asarray(row[index])) for row in rows))
+    rows = play_on_all(folder, backends=names, episodes=episodes, which=policy, options=options)
+    if as_json:
+        found = [{"backend": r.backend, "settings": r.settings, **spread(r.metrics)} for r in rows]
+        print(json.dumps(found, indent=2))
+        return
+    titles = [
+        ",\n".join([row.backend, *(f"{name}={value}" for name, value in row.settings.items())])
+        for row in rows
+    ]
+    columns = (Column(title, justify="right") for title in titles)
+    table = Table("", *columns, title=", ".join([folder.config.env, f"{policy} policy", *settings]))
+    for name, unit in _UNITS.items():
+        if name in rows[0].metrics:
+            table.add_row(unit, *(_mean_and_spread(row.metrics[name]) for row in rows))
     out.print(table)
 
 
@@ -236,7 +253,8 @@ def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
     title = f"{config.env} on {backend}, {which} policy, {arguments['episodes']} episode(s)"
     table = Table("", "mean", "std", "min", "max", title=title)
     for name, values in spread(metrics).items():
-        table.add_row(_UNITS[name], *(f"{value:.2f}" for value in values.values()))
+        cells = ["-"] * 4 if values is None else [f"{value:.2f}" for value in values.values()]
+        table.add_row(_UNITS[name], *cells)
     out.print(table)
 
 

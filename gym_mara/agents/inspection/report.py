@@ -14,7 +14,7 @@ from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.watch import film_run
 from gym_mara.agents.runs.evaluation import options_on
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.backends import installed_backends
+from gym_mara.backends import usable_backends
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.files import read_text, write_text, writing
@@ -30,7 +30,7 @@ _VIDEO_SECONDS = 4
 
 
 def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last") -> Path:
-    """Play a run's policy for an episode on every installed backend, and write a page about it and about the training.
+    """Play a run's policy for an episode on every backend that works here, and write a page about it and about the training.
 
     Args:
         run: the run.
@@ -46,8 +46,8 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
     """
     new, file = file is not None, _checked(run, file)
     config = run.config
-    installed, missing = installed_backends()
-    backends = [config.backend, *(name for name in installed if name != config.backend)]
+    usable, missing = usable_backends()
+    backends = [config.backend, *(name for name in usable if name != config.backend)]
     episodes = []
     for backend in backends:
         with Player(run, backend, options_on(backend, config), which=which) as player:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player, roll_out
 from gym_mara.agents.runs.evaluation import options_beyond_backend, with_options
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.backends import backend_settings, installed_backends
+from gym_mara.backends import backend_settings, usable_backends
 from gym_mara.envs import task_keywords
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown, whole_number
@@ -28,7 +29,9 @@ class Transferred(NamedTuple):
     """How a policy did on one backend; each array is (N,), over N episodes."""
 
     backend: str
-    """Its name, and its settings that differ from its defaults."""
+    """Its name."""
+    settings: dict[str, Any]
+    """Those of its settings that differ from its defaults."""
     position_error_mm: Floats
     """At the last step."""
     angle_deg: Floats
@@ -42,14 +45,26 @@ class Transferred(NamedTuple):
     highest_velocity: Floats
     """Of any joint, rad/s; NaN where the joints teleport."""
 
+    @property
+    def metrics(self) -> dict[str, Floats]:
+        """The arrays by name; that of `return_` is "return"."""
+        names = (name.rstrip("_") for name in self._fields[2:])
+        return dict(zip(names, self[2:], strict=True))
+
 
 def transfer(
-    run: RunFolder, *, episodes: int = 1, which: str = "last", options: dict[str, Any] | None = None
+    run: RunFolder,
+    *,
+    backends: Sequence[str] = (),
+    episodes: int = 1,
+    which: str = "last",
+    options: dict[str, Any] | None = None,
 ) -> list[Transferred]:
-    """Play a run's deterministic policy on every installed backend.
+    """Play a run's deterministic policy on several backends.
 
     Args:
         run: the run.
+        backends: their names; if none is given all that work on this machine, with a warning for each of the others.
         episodes: how many on each backend; they differ only if the options make them random.
         which: the policy, "last" or "best".
         options: keyword arguments of the environment. Those of the task, the sensors and the robot count on every
@@ -61,20 +76,22 @@ def transfer(
         limit for all joints.
 
     Raises:
-        GymMaraError: the policy is missing or damaged, or an option is unknown or out of range.
+        GymMaraError: the policy is missing or damaged; a backend is unknown or does not work; or an option is unknown or out
+            of range.
     """
     whole_number("episodes", episodes)
     of_env, given = options_beyond_backend(run.config), options or {}
-    installed, reasons = installed_backends()
-    for reason in reasons:
-        warnings.warn(reason, stacklevel=2)
-    settings = {name: backend_settings(name) for name in installed}
+    if not backends:
+        backends, reasons = usable_backends()
+        for reason in reasons:
+            warnings.warn(f"left out: {reason}", stacklevel=2)
+    settings = {name: backend_settings(name) for name in backends}
     sensors = {field.name for field in fields(SensorSettings)}
     everywhere = {*ROBOT_KEYWORDS, *task_keywords(run.config.env), *sensors}
     for name in given:
         valid = everywhere.union(*settings.values())
         if name not in valid:
-            raise unknown("keyword argument", name, valid, " on any installed backend")
+            raise unknown("keyword argument", name, valid, " on any of these backends")
     rows = []
     for name, known in settings.items():
         chosen = {key: value for key, value in given.items() if key in everywhere or key in known}
@@ -103,9 +120,10 @@ def _play(
         played = roll_out(player)
         robot, velocity_limit = player.env.simulation.robot, player.velocity_limit
         teleports = player.env.simulation.backend.teleports
-    own = (f"{key}={value}" for key, value in chosen.items() if key in backend_settings(backend))
+    known = backend_settings(backend)
     row = Transferred(
-        backend=", ".join([backend, *own]),
+        backend=backend,
+        settings={key: value for key, value in chosen.items() if key in known},
         position_error_mm=1000.0 * played.position_error[-1],
         angle_deg=np.degrees(played.angle_error[-1]),
         return_=played.reward.sum(axis=0),

@@ -161,14 +161,17 @@ def play(policy: PolicyPredictor, env: VecEnv) -> dict[str, Floats]:
     return {name: np.array(column, float) for name, column in zip(METRICS, columns, strict=True)}
 
 
-def spread(metrics: dict[str, Floats]) -> dict[str, dict[str, float]]:
-    """Mean, standard deviation, minimum and maximum of each metric over the episodes."""
+def spread(metrics: dict[str, Floats]) -> dict[str, dict[str, float] | None]:
+    """Mean, standard deviation, minimum and maximum of each metric over the episodes that have a value; None if none has."""
+    return {name: _spread(values[~np.isnan(values)]) for name, values in metrics.items()}
+
+
+def _spread(values: Floats) -> dict[str, float] | None:
+    if not len(values):
+        return None
     return {
-        name: {
-            "mean": float(values.mean()),
-            "std": float(values.std()),
-            "min": float(values.min()),
-            "max": float(values.max()),
-        }
-        for name, values in metrics.items()
+        "mean": float(values.mean()),
+        "std": float(values.std()),
+        "min": float(values.min()),
+        "max": float(values.max()),
     }

@@ -25,7 +25,7 @@ from gym_mara.errors import GymMaraError
 
 pytestmark = pytest.mark.slow
 
-GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=8192, checkpoint_every=2048)
+GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 
-SMALL = Search(env="MARA-v0", algo="acktr", steps=4096, trials=2, seeds=1)
+SMALL = Search(env="MARA-v0", algo="acktr", steps=512, trials=2, seeds=1)
 
 
 def ignore(*arguments: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.errors import GymMaraError
 from tests.agents.conftest import ROLLOUT, config, silent
+from tests.backends.fake import FakeBackend
 
 PERIOD = 0.1
 
@@ -41,17 +43,59 @@ def test_an_arm_has_settled_once_it_stays_at_the_target(
     np.testing.assert_allclose(times, [np.nan if seconds is None else seconds, 0.0])
 
 
-def test_an_option_of_the_task_counts_on_every_backend(
-    finished_run: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "roll_out", partial(roll_out, steps=20))
+
+
+@pytest.mark.usefixtures("_short_episodes")
+def test_a_policy_plays_on_every_engine(finished_run: RunFolder) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "left out: the backend 'warp'")
+        rows = transfer(finished_run)
+    played = [(row.backend, row.settings) for row in rows]
+    kinematic = [("pinocchio", {}), ("pinocchio", {"max_joint_velocity": 1.57})]
+    expected = [("dart", {}), ("mujoco", {}), *kinematic]
+    assert [each for each in played if each[0] != "warp"] == expected
+    of = dict(zip((row.backend for row in rows), rows, strict=False))
+    # Both engines with dynamics have the same servos.
+    mine, theirs = of["mujoco"].metrics, of["dart"].metrics
+    np.testing.assert_allclose(mine["position_error_mm"], theirs["position_error_mm"], atol=3.0)
+    assert (mine["highest_torque"] > 0.0).all()
+
+
+@pytest.mark.usefixtures("_short_episodes")
+def test_only_the_chosen_backends_are_played(finished_run: RunFolder) -> None:
+    rows = transfer(finished_run, backends=["mujoco"], options={"servo_gain": 50.0})
+    assert [(row.backend, row.settings) for row in rows] == [("mujoco", {"servo_gain": 50.0})]
+    with pytest.raises(GymMaraError, match="unknown backend 'mojuco'"):
+        transfer(finished_run, backends=["mojuco"])
+
+
+@pytest.mark.usefixtures("_short_episodes")
+def test_a_backend_that_this_machine_cannot_run_is_left_out_with_the_reason(
+    finished_run: RunFolder, fake_backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_gpu() -> None:
+        raise GymMaraError("no GPU")
+
+    monkeypatch.setattr(FakeBackend, "require_machine", no_gpu)
+    with pytest.warns(UserWarning, match="left out: no GPU"):
+        rows = transfer(finished_run)
+    assert fake_backend not in [row.backend for row in rows]
+    # It may work with other settings, which only who names it knows.
+    assert [row.backend for row in transfer(finished_run, backends=[fake_backend])] == ["fake"]
+
+
+@pytest.mark.usefixtures("_short_episodes")
+def test_an_option_of_the_task_counts_on_every_backend(finished_run: RunFolder) -> None:
     options: dict[str, Any] = {"target_position": [-0.3, 0.1, 0.8], "servo_gain": 50.0}
-    rows = transfer(finished_run, options=options)
-    titles = [row.backend for row in rows]
-    assert not any("target_position" in title for title in titles), "it is the same for all"
-    assert all(("servo_gain" in title) == title.startswith("dart") for title in titles)
-    before = {row.backend: row for row in transfer(finished_run)}
-    assert rows[0].position_error_mm != before["dart"].position_error_mm
+    backends = ["dart", "pinocchio"]
+    rows = transfer(finished_run, backends=backends, options=options)
+    assert not any("target_position" in row.settings for row in rows), "it is the same for all"
+    assert all(("servo_gain" in row.settings) == (row.backend == "dart") for row in rows)
+    before = transfer(finished_run, backends=backends)
+    assert rows[0].position_error_mm != before[0].position_error_mm
 
 
 def test_the_settings_of_the_training_have_a_row(tmp_path: Path) -> None:
@@ -60,10 +104,10 @@ def test_the_settings_of_the_training_have_a_row(tmp_path: Path) -> None:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "roll_out", partial(roll_out, steps=5))
-        titles = [row.backend for row in transfer(slow)]
-    limits = [title.partition("max_joint_velocity=")[2] for title in titles]
-    assert titles[0] == "dart"
-    assert limits[1:] == ["0.5", "", "1.57"]
+        rows = transfer(slow, backends=["pinocchio", "dart"])
+    limits = [row.settings.get("max_joint_velocity") for row in rows]
+    assert [row.backend for row in rows] == ["pinocchio"] * 3 + ["dart"]
+    assert limits == [0.5, None, 1.57, None]
 
 
 def test_an_episode_has_the_length_of_the_environment(tmp_path: Path) -> None:
@@ -77,8 +121,8 @@ def test_an_episode_has_the_length_of_the_environment(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["target_positon", "camera", "task", "num_envs", "render_mode"])
 def test_an_unknown_option_is_an_error(finished_run: RunFolder, name: str) -> None:
-    with pytest.raises(GymMaraError, match=f"unknown keyword argument '{name}' on any installed"):
-        transfer(finished_run, options={name: 1})
+    with pytest.raises(GymMaraError, match=f"unknown keyword argument '{name}' on any of"):
+        transfer(finished_run, backends=["dart", "pinocchio"], options={name: 1})
 
 
 @pytest.mark.parametrize("episodes", [0, -1, 1.5, True])
