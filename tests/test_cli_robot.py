@@ -51,7 +51,9 @@ def test_the_json_has_the_same(gym_mara: Cli, tmp_path: Path) -> None:
     assert found["backends"] == dict.fromkeys(backend_names())
 
 
-@pytest.mark.parametrize(("backend", "code"), [("dart", 1), ("mujoco", 1), ("pinocchio", 0), (None, 0)], ids=str)
+@pytest.mark.parametrize(
+    ("backend", "code"), [("dart", 1), ("mujoco", 1), ("pinocchio", 0), (None, 0)], ids=str
+)
 def test_the_exit_code_says_whether_the_arm_works_on_the_backend(
     gym_mara: Cli, tmp_path: Path, backend: str | None, code: int
 ) -> None:
