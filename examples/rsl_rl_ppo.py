@@ -20,18 +20,18 @@ with needs("this example", "rsl"):
     from rsl_rl.runners import OnPolicyRunner
     from tensordict import TensorDict
 
-ROLLOUT = 24
-EVALUATION = 100
+ROLLOUT, EPISODE, EVALUATION = 24, 256, 100
+"""Control steps."""
 _NETWORK = {"class_name": "MLPModel", "hidden_dims": [64, 64], "obs_normalization": True}
-_NOISE = {"class_name": "GaussianDistribution", "init_std": 0.2}
+_NOISE = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": "log"}
 CONFIG: dict[str, Any] = {
     "num_steps_per_env": ROLLOUT,
     "save_interval": 100,
     "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
     "actor": _NETWORK | {"distribution_cfg": _NOISE},
     "critic": _NETWORK,
-    # An action is rewarded some tenths of a second later.
-    "algorithm": {"class_name": "PPO", "gamma": 0.98, "entropy_coef": 0.0},
+    # An action is rewarded a few steps later.
+    "algorithm": {"class_name": "PPO", "gamma": 0.9, "entropy_coef": 0.0},
 }
 """What differs from RSL-RL's own values, or has none."""
 
@@ -66,9 +66,10 @@ class RslRlEnv(VecEnv):  # type: ignore[misc]
 
 
 def make(arms: int, device: str, task: str = "MARA-v0") -> RslRlEnv:
-    """The arms, with full dynamics."""
+    """The arms, with full dynamics and short episodes."""
     options: dict[str, Any] = {"backend": "warp", "arrays": "torch", "device": device}
-    return RslRlEnv(MaraVectorEnv(arms, task, autoreset_mode="SameStep", **options))
+    options |= {"max_episode_steps": EPISODE, "autoreset_mode": "SameStep"}
+    return RslRlEnv(MaraVectorEnv(arms, task, **options))
 
 
 def train(env: RslRlEnv, steps: int, folder: str | None = None) -> OnPolicyRunner:
