@@ -15,7 +15,6 @@ import contextlib
 import json
 import os
 import platform
-import signal
 import subprocess
 import sys
 import tempfile
@@ -43,6 +42,7 @@ AT_EACH, AT_ONE = ("dynamics", "kinematics"), ("dynamics in contact", "travellin
 RATE, BARE, RATIO = "steps/s", "bare CUDA graph, steps/s", "relative to the bare graph"
 MEMORY, START = "device memory, MB", "from the start to the first step, s"
 CONTACTS = "points of contact an arm"
+FAILED = "failed"
 TARGETS = {
     ("dynamics", 32768, RATE): "at least 1,000,000",
     ("dynamics", 32768, RATIO): "at least 0.7",
@@ -64,11 +64,9 @@ def wait(device: str) -> None:
 
 
 def memory(device: str) -> float:
-    """The memory in use on a GPU, MB; 0 on a CPU."""
+    """The memory in use on a GPU, MB."""
     import torch
 
-    if device == "cpu":
-        return 0.0
     free, total = torch.cuda.mem_get_info(device)
     return (total - free) / 1e6
 
@@ -147,12 +145,13 @@ def start(arms: int, device: str, seconds: float) -> Results:
 def dynamics(arms: int, device: str, seconds: float) -> Results:
     """Full dynamics with contacts, compared with MuJoCo Warp alone."""
     wait(device)  # so that the libraries' own memory does not count
-    before = memory(device)
+    before = 0.0 if device == "cpu" else memory(device)
     env = make(arms, device)
     env.reset(seed=0)
     run = steps_of(env, device)
     run()
-    yield MEMORY, memory(device) - before
+    if device != "cpu":
+        yield MEMORY, memory(device) - before
     yield CONTACTS, points_of_contact(env)
     alone = rates({RATE: run}, seconds)
     yield RATE, alone[RATE]
@@ -216,24 +215,30 @@ def measure(name: str, arms: int, device: str, seconds: float) -> None:
     """Write the results of one measurement to standard output, each as soon as it is known, and all else to standard error."""
     with os.fdopen(os.dup(sys.stdout.fileno()), "w") as results:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        for result in MEASURES[name](arms, device, seconds):
-            print(json.dumps(result), file=results, flush=True)
+        try:
+            for result in MEASURES[name](arms, device, seconds):
+                print(json.dumps(result), file=results, flush=True)
+        except Exception as error:
+            why = " ".join(f"{type(error).__name__}: {error}".split())
+            print(json.dumps((FAILED, why)), file=results, flush=True)
+            raise
 
 
 def in_own_process(*arguments: str, timeout: float) -> Iterator[tuple[str, float | str]]:
-    """The results of a measurement, and at its end what went wrong, if anything."""
-    command = [sys.executable, __file__, *arguments]
+    """The results of a measurement, and what went wrong, if anything."""
+    command, known = [sys.executable, __file__, *arguments], False
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         stopper = threading.Timer(timeout, process.kill)
         stopper.start()
         assert process.stdout is not None
         for line in process.stdout:
-            yield tuple(json.loads(line))
-        code = process.wait()
+            what, value = json.loads(line)
+            known = known or what == FAILED
+            yield what, value
+        code, late = process.wait(), not stopper.is_alive()
         stopper.cancel()
-    if code:
-        late = f"not ready after {timeout:g} s" if code == -signal.SIGKILL else "see above"
-        yield "failed", f"exit code {code}, {late}"
+    if code and not known:
+        yield FAILED, f"not ready after {timeout:g} s" if late else f"exit code {code}"
 
 
 def card(device: str) -> str:
