@@ -9,7 +9,6 @@ import argparse
 import resource
 import warnings
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,9 @@ from gym_mara.robot import RobotModel
 ENV_ID = "gym_mara/MARACollisionOrient-v0"
 ARMS = 64
 BARE = "mujoco.rollout alone, one thread"
-BARE_PERIOD = f"{BARE}, without the step for the contacts at the end"
 RATIOS = (
     ("mujoco, one thread", "dart, one process", "at least 3"),
     ("mujoco, one thread", BARE, "at least 0.8"),
-    ("mujoco, one thread", BARE_PERIOD, ""),
     ("mujoco, two threads", "mujoco, one thread", "at least 1.8"),
     ("dart, two processes", "dart, one process", ""),
 )
@@ -70,9 +67,8 @@ def bare_steps(actions: Any) -> Callable[[], int]:
     return run
 
 
-def bare_rollouts() -> dict[str, Callable[[], int]]:
-    """mujoco.rollout alone in one thread, with the model, states and commands of `batch`; with and without the step that each
-    period has for the contacts at its end."""
+def bare_rollouts() -> Callable[[], int]:
+    """mujoco.rollout alone in one thread, with the model, states, commands and number of steps of `batch`."""
     envs: Any = gymnasium.make_vec(ENV_ID, num_envs=ARMS, backend="mujoco", threads=1)
     backend = envs.unwrapped.simulation.backend
     assert isinstance(backend, MujocoBackend)
@@ -80,8 +76,8 @@ def bare_rollouts() -> dict[str, Callable[[], int]]:
     periods: list[tuple[Any, ...]] = []
 
     def record(models: Any, states: Any, warmstarts: Any, commands: Any) -> Any:
-        if commands.shape[1] > 1:  # otherwise a reset looks for contacts
-            periods.append((models, states.copy(), warmstarts.copy(), commands))
+        if commands.shape[1] > 1:  # otherwise it looks for contacts
+            periods.append((models, states.copy(), warmstarts.copy(), commands.copy()))
         return run_on(models, states, warmstarts, commands)
 
     stepper.run = record  # type: ignore[method-assign, assignment]
@@ -91,15 +87,13 @@ def bare_rollouts() -> dict[str, Callable[[], int]]:
         envs.step(envs.action_space.sample())
     data, rollout = [mujoco.MjData(backend._model)], Rollout(nthread=0)
 
-    def run(steps: int) -> int:
+    def run() -> int:
         for models, states, warmstarts, commands in periods:
-            controls = np.ascontiguousarray(commands[:, :steps])
-            options = {"initial_warmstart": warmstarts, "nstep": steps, "skip_checks": True}
-            rollout.rollout(models, data, states, controls, **options)
+            options = {"initial_warmstart": warmstarts, "nstep": commands.shape[1]}
+            rollout.rollout(models, data, states, commands, skip_checks=True, **options)
         return ARMS * len(periods)
 
-    all_steps = periods[0][-1].shape[1]
-    return {BARE: partial(run, all_steps), BARE_PERIOD: partial(run, all_steps - 1)}
+    return run
 
 
 def print_step() -> None:
@@ -123,7 +117,7 @@ def print_batches() -> None:
         "dart, two processes": batch(ENV_ID, ARMS, backend="dart", workers=2),
         "mujoco, one thread": batch(ENV_ID, ARMS, backend="mujoco", threads=1),
         "mujoco, two threads": batch(ENV_ID, ARMS, backend="mujoco", threads=2),
-        **bare_rollouts(),
+        BARE: bare_rollouts(),
     }
     measured = rates(functions)
     print(f"\n## {ARMS} arms\n")
