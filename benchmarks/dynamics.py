@@ -1,7 +1,11 @@
-"""Speed of the dynamic backend, compared with DART alone and with other packages, and its energy drift; prints Markdown."""
+"""Speed of the dynamic backends, compared with their engines alone, with each other and with other packages; prints Markdown.
+
+`--no-training` leaves out the trainings, which take about five minutes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import resource
 import warnings
 from collections.abc import Callable
@@ -9,15 +13,28 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
-from speed import PEERS, batch, rates, row, single
+from mujoco.rollout import Rollout
+from speed import PEERS, batch, single
+from timing import rates, row
+from training import print_dynamic_training
 
 import gym_mara  # noqa: F401 - registers the environments
 from gym_mara.backends.dart.arm import DartArm
 from gym_mara.backends.dart.backend import DartBackend
+from gym_mara.backends.mujoco.backend import MujocoBackend
 from gym_mara.robot import RobotModel
 
 ENV_ID = "gym_mara/MARACollisionOrient-v0"
+ARMS = 64
+BARE = "mujoco.rollout alone, one thread"
+RATIOS = (
+    ("mujoco, one thread", "dart, one process", "at least 3"),
+    ("mujoco, one thread", BARE, "at least 0.8"),
+    ("mujoco, two threads", "mujoco, one thread", "at least 1.8"),
+    ("dart, two processes", "dart, one process", ""),
+)
 
 
 def bare_steps(actions: Any) -> Callable[[], int]:
@@ -50,9 +67,33 @@ def bare_steps(actions: Any) -> Callable[[], int]:
     return run
 
 
-def dynamic(env_id: str = ENV_ID, **options: Any) -> Callable[[], int]:
-    """Steps of one dynamic environment through gymnasium.make, with random actions."""
-    return single(env_id, backend="dart", **options)
+def bare_rollouts() -> Callable[[], int]:
+    """mujoco.rollout alone in one thread, with the model, states, commands and number of steps of `batch`."""
+    envs: Any = gymnasium.make_vec(ENV_ID, num_envs=ARMS, backend="mujoco", threads=1)
+    backend = envs.unwrapped.simulation.backend
+    assert isinstance(backend, MujocoBackend)
+    stepper, run_on = backend._stepper, backend._stepper.run
+    periods: list[tuple[Any, ...]] = []
+
+    def record(models: Any, states: Any, warmstarts: Any, commands: Any) -> Any:
+        if commands.shape[1] > 1:  # otherwise it looks for contacts
+            periods.append((models, states.copy(), warmstarts.copy(), commands.copy()))
+        return run_on(models, states, warmstarts, commands)
+
+    stepper.run = record  # type: ignore[method-assign, assignment]
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    for _ in range(10):
+        envs.step(envs.action_space.sample())
+    data, rollout = [mujoco.MjData(backend._model)], Rollout(nthread=0)
+
+    def run() -> int:
+        for models, states, warmstarts, commands in periods:
+            options = {"initial_warmstart": warmstarts, "nstep": commands.shape[1]}
+            rollout.rollout(models, data, states, commands, skip_checks=True, **options)
+        return ARMS * len(periods)
+
+    return run
 
 
 def print_step() -> None:
@@ -60,7 +101,7 @@ def print_step() -> None:
     env = gymnasium.make(ENV_ID, backend="dart")
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(200)]
-    measured = rates({"bare": bare_steps(actions), "env": dynamic()})
+    measured = rates({"bare": bare_steps(actions), "env": single(ENV_ID, backend="dart")})
     print("\n## One dynamic environment, compared with its world.step() calls\n")
     row("", "steps per second", "relative time")
     row("---", "---", "---")
@@ -69,22 +110,32 @@ def print_step() -> None:
     row(f"{ENV_ID}, backend='dart'", f"{measured['env']:,.0f}", f"{ratio:.2f}")
 
 
-def print_workers() -> None:
-    """Compare the same arms in one process and in two."""
+def print_batches() -> None:
+    """Compare 64 arms in both engines, in one thread or process and in two, and MuJoCo alone."""
     functions = {
-        str(workers): batch(ENV_ID, 64, backend="dart", workers=workers) for workers in (1, 2)
+        "dart, one process": batch(ENV_ID, ARMS, backend="dart", workers=1),
+        "dart, two processes": batch(ENV_ID, ARMS, backend="dart", workers=2),
+        "mujoco, one thread": batch(ENV_ID, ARMS, backend="mujoco", threads=1),
+        "mujoco, two threads": batch(ENV_ID, ARMS, backend="mujoco", threads=2),
+        BARE: bare_rollouts(),
     }
     measured = rates(functions)
-    print("\n## 64 arms in worker processes\n")
-    row("workers", "steps per second", "relative")
+    print(f"\n## {ARMS} arms\n")
+    row("", "steps per second")
+    row("---", "---")
+    for name, rate in measured.items():
+        row(name, f"{rate:,.0f}")
+    print()
+    row("", "ratio", "target")
     row("---", "---", "---")
-    for workers, rate in measured.items():
-        row(workers, f"{rate:,.0f}", f"{rate / measured['1']:.2f}")
+    for one, other, target in RATIOS:
+        row(f"{one} / {other}", f"{measured[one] / measured[other]:.2f}", target)
 
 
 def print_peers() -> None:
     """Compare one dynamic environment with the other packages that are installed."""
-    functions = {f"{ENV_ID}, backend='dart'": dynamic()}
+    ours = {f"{ENV_ID}, backend='{name}'": name for name in ("mujoco", "dart")}
+    functions = {name: single(ENV_ID, backend=backend) for name, backend in ours.items()}
     for module, env_id in PEERS.items():
         try:
             with warnings.catch_warnings():
@@ -94,12 +145,12 @@ def print_peers() -> None:
         except Exception as error:
             print(f"\n{env_id} cannot run here: {type(error).__name__} {error}")
     measured = rates(functions)
-    ours = next(iter(measured.values()))
     print("\n## One dynamic environment, compared with other packages\n")
-    row("environment", "steps per second", "ours is faster by")
-    row("---", "---", "---")
+    row("environment", "steps per second", *(f"{name} is faster by" for name in ours.values()))
+    row("---", "---", "---", "---")
     for name, rate in measured.items():
-        row(name, f"{rate:,.0f}", f"{ours / rate:.2f}")
+        row(name, f"{rate:,.0f}", *(f"{measured[one] / rate:.2f}" for one in ours))
+    print("\nTarget: mujoco is faster than the other packages by at least 4.")
 
 
 def _resident() -> float:
@@ -165,9 +216,19 @@ def energies(arm: DartArm, seconds: float) -> tuple[Any, Any]:
     return np.array(kinetic), np.array(kinetic) + np.array(potential)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--no-training", action="store_true", help="do not measure the trainings")
+    arguments = parser.parse_args()
     print_step()
-    print_workers()
+    print_batches()
     print_peers()
     print_memory()
     print_energy()
+    if not arguments.no_training:
+        print_dynamic_training()
+
+
+if __name__ == "__main__":
+    main()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import time
 import warnings
 from collections.abc import Callable
 from importlib.metadata import version
@@ -19,6 +18,7 @@ import gymnasium
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from timing import rates, row
 from training import print_training
 
 import gym_mara
@@ -27,22 +27,6 @@ from gym_mara.tasks import PAPER_TASKS
 
 NUM_ENVS = (1, 16, 256, 1024)
 PEERS = {"panda_gym": "PandaReach-v3", "gymnasium_robotics": "FetchReach-v4"}
-REPETITIONS = 15
-SECONDS = 0.2
-
-
-def rates(functions: dict[str, Callable[[], int]]) -> dict[str, float]:
-    """Steps per second of each function, the best of several turns; a function returns its number of steps."""
-    best = dict.fromkeys(functions, 0.0)
-    for function in functions.values():
-        function()  # warm up
-    for _ in range(REPETITIONS):
-        for name, function in functions.items():
-            steps, start = 0, time.perf_counter()
-            while (elapsed := time.perf_counter() - start) < SECONDS:
-                steps += function()
-            best[name] = max(best[name], steps / elapsed)
-    return best
 
 
 def single(env_id: str, **options: Any) -> Callable[[], int]:
@@ -106,11 +90,6 @@ def floor(q: NDArray[np.float64]) -> Callable[[], int]:
         return len(q)
 
     return run
-
-
-def row(*cells: object) -> None:
-    """Print a row of a Markdown table."""
-    print("|", " | ".join(str(cell) for cell in cells), "|", flush=True)
 
 
 def print_throughput() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 from idle_vec_env import IdleVecEnv
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -13,6 +14,7 @@ from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent
 
 STEPS = 1_000_000
+DYNAMIC_STEPS = 300_000
 SLICES = 5
 
 
@@ -35,6 +37,31 @@ def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
     start = time.perf_counter()
     model.learn(steps, reset_num_timesteps=False)
     return time.perf_counter() - start
+
+
+def print_dynamic_training() -> None:
+    """Train PPO from scratch on both dynamic backends, slice by slice in turn, as `gym-mara train` does, and print the times."""
+    print(f"\n## Training with PPO on dynamics, MARA-v0, {DYNAMIC_STEPS:,} steps from scratch\n")
+    preset = algorithm("ppo").preset("tuned", teleports=False)
+    ways: dict[str, dict[str, Any]] = {
+        "mujoco": {},
+        "dart": {},
+        "dart, one process": {"workers": 1},
+    }
+    models = {}
+    for name, options in ways.items():
+        env = make_env("MARA-v0", name.partition(",")[0], preset.num_envs, options)
+        models[name] = new_agent("ppo", preset, env, seed=0)
+    seconds = dict.fromkeys(models, 0.0)
+    for _ in range(SLICES):
+        for name, model in models.items():
+            seconds[name] += _learn(model, DYNAMIC_STEPS // SLICES)
+    learner = _learn(new_agent("ppo", preset, IdleVecEnv(env), seed=0), DYNAMIC_STEPS)
+    print("| backend | s | mujoco's time, relative to it | target |")
+    print("|---|---|---|---|")
+    for name, spent in (seconds | {"none: arms that do nothing": learner}).items():
+        target = "at most 0.4" if name == "dart" else ""
+        print(f"| {name} | {spent:.1f} | {seconds['mujoco'] / spent:.2f} | {target} |", flush=True)
 
 
 def update_costs(batch: int = 2048) -> dict[str, float]:

@@ -25,6 +25,7 @@ CALLS = {
     "cleanrl_ppo.py": "reward per step",
     "cleanrl_ppo.py --env-id gym_mara/MARARandomTarget-v0": "reward per step",
     "skrl_ppo.py": "reward per step",
+    "rsl_rl_ppo.py --device cpu --arms 8": "position error",
     "torchrl_ppo.py": "reward per step",
     "tianshou_ppo.py": "reward per step",
     "sbx_ppo.py": "position error",

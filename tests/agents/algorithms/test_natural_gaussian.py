@@ -52,6 +52,18 @@ def test_it_is_the_gaussian_with_its_mean_and_covariance(distribution: NaturalGa
     torch.testing.assert_close(distribution.mode(), referee.mean)
 
 
+def test_without_gradients_it_follows_its_parameters(distribution: NaturalGaussian) -> None:
+    again, mean, centre = NaturalGaussian(), distribution.mean, distribution.centre
+    log_scale, factor = distribution.log_scale.clone(), distribution.factor.clone()
+    for change in (lambda: log_scale.mul_(0.5), lambda: factor.mul_(2.0), lambda: None):
+        change()
+        expected = NaturalGaussian().proba_distribution(mean, log_scale, centre, factor)
+        with torch.no_grad():
+            again.proba_distribution(mean, log_scale, centre, factor)
+        for name in ("scale", "inverse_scale", "log_volume"):
+            assert torch.equal(getattr(again, name), getattr(expected, name))
+
+
 def test_its_divergence_is_that_of_torch_s_gaussians(distribution: NaturalGaussian) -> None:
     generator = torch.Generator().manual_seed(2)
     noise = 0.1 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
