@@ -104,10 +104,10 @@ def bare_steps(env: MaraVectorEnv, device: str) -> Callable[[], int]:
         model = warp_model(backend.robot, engine._physics_step)
         room = {"njmax": engine.data.njmax, "naconmax": engine.data.naconmax}
         data = mjw.make_data(model, env.num_envs, **room)
-        mjw.step(engine._model, data)  # loads the kernels, which a capture must not
+        mjw.step(engine.model, data)  # loads the kernels, which a capture must not
         with capturing(engine.device) as capture:
             for _ in range(engine._steps):
-                mjw.step(engine._model, data)
+                mjw.step(engine.model, data)
 
     def run() -> int:
         with wp.ScopedDevice(engine.device):
