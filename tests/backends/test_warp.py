@@ -5,6 +5,7 @@ All numbers of the engine are in single precision. The tolerances follow from it
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.testing import COLLIDING_Q, arrays_of, assert_same_state, pickled, uniform_q
-from tests.helpers import write
+from tests.helpers import upright_arm, write
 
 # The path from home is free of collisions.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
@@ -99,6 +100,22 @@ def test_it_moves_as_mujoco_does_and_holds_the_arm_with_the_same_torques(mara: R
     np.testing.assert_allclose(mine.torque, theirs.torque, rtol=0.0, atol=0.1)
     gravity = pin.computeGeneralizedGravity(mara.model, mara.model.createData(), FREE_TARGET)
     np.testing.assert_allclose(mine.torque[0], gravity, rtol=0.0, atol=0.1)
+
+
+def test_without_dynamics_an_arm_needs_no_inertias_and_a_joint_that_follows_moves_along(
+    tmp_path: Path,
+) -> None:
+    bar = """
+      <link name="bar"><collision><origin xyz="0 0 0.15"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>
+      <joint name="bar" type="revolute"><parent link="l1"/><child link="bar"/><origin xyz="-0.1 0 0.3"/>
+        <axis xyz="0 1 0"/><mimic joint="j2" multiplier="2" offset="-0.1"/></joint>"""
+    text = re.sub("<inertial>.*?</inertial>", "", upright_arm(bar), flags=re.DOTALL)
+    robot = RobotModel.load(write(tmp_path / "arm.urdf", text), "tool")
+    q = uniform_q(robot, 200, seed=0)
+    state = _warp(robot, len(q), dynamics=False).step(q)
+    np.testing.assert_array_equal(state.collided, make_checker("coal", robot).check(q))
+    assert state.contacts is not None
+    assert any("bar" in contact.links for found in state.contacts for contact in found)
 
 
 RANDOM = {
