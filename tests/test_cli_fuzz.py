@@ -114,13 +114,14 @@ KEYWORDS = [
         "viewer_host",
     ),
     *("default_mass", "effort_limit", "velocity_limit", "package_dirs", "convex_hulls"),
+    *("threads", "dynamics", "arrays", "device", "max_contacts"),
     *("robt", "", "1", "a b", "__class__", "options"),
 ]
 SETTINGS = ["kappa=0.5", "max_joint_velocity=1", "robot=ur5", "on_collision=terminate", "robt=mara"]
 VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
-    "backend": ["pinocchio", "pinocchio", "dart"],
+    "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
     "policy": ["last", "best"],
     "preset": preset_names(),
     "executor": ["local"],

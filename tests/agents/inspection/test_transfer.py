@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from tests.agents.conftest import ROLLOUT, config, silent
 from tests.backends.fake import FakeBackend
 
 PERIOD = 0.1
+pytestmark = pytest.mark.filterwarnings("ignore:left out. the backend 'warp'")  # without a GPU
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,7 @@ def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_short_episodes")
 def test_a_policy_plays_on_every_engine(finished_run: RunFolder) -> None:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "left out: the backend 'warp'")
-        rows = transfer(finished_run)
+    rows = transfer(finished_run)
     played = [(row.backend, row.settings) for row in rows]
     kinematic = [("pinocchio", {}), ("pinocchio", {"max_joint_velocity": 1.57})]
     expected = [("dart", {}), ("mujoco", {}), *kinematic]
