@@ -1,4 +1,4 @@
-"""Unit quaternions [w, x, y, z] in NumPy, batched over leading axes.
+"""Unit quaternions [w, x, y, z], batched over leading axes, as arrays of NumPy or torch.
 
 Each row goes through the same sequence of operations, so that its result does not depend on the rest of the batch.
 
@@ -9,25 +9,26 @@ from __future__ import annotations
 
 import numpy as np
 
+from gym_mara.arrays import Constants, namespace
 from gym_mara.types import Floats
 
 # a ⊗ b as a matrix of b times a: entry (i, j) is sign[i, j] * b[index[i, j]].
-_RIGHT_INDEX = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
-_RIGHT_SIGN = np.array(
-    [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]]
+_RIGHT = Constants(
+    [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]],
+    [[1.0, -1.0, -1.0, -1.0], [1.0, 1.0, 1.0, -1.0], [1.0, -1.0, 1.0, 1.0], [1.0, 1.0, -1.0, 1.0]],
 )
 ZERO = 1e-9
 """Components with an absolute value up to this count as zero."""
-# Arrays, because a NumPy ufunc on one row takes twice as long with a Python number.
-_ZERO, _ONE, _TWO = np.array(ZERO), np.array(1.0), np.array(2.0)
+_ZERO_AND_ONE, _ONE_AND_TWO = Constants(ZERO, 1.0), Constants(1.0, 2.0)
 # The weights of the components: each component that is not zero outweighs all that follow it.
-_PRECEDENCE = np.array([1e30, 1e20, 1e10, 1.0])
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+_PRECEDENCE = Constants([1e30, 1e20, 1e10, 1.0])
+_CONJUGATE = Constants([1.0, -1.0, -1.0, -1.0])
 
 
 def right_matrix(b: Floats) -> Floats:
     """The matrices M (..., 4, 4) with M a = a ⊗ b, for quaternions b (..., 4)."""
-    return b[..., _RIGHT_INDEX] * _RIGHT_SIGN
+    _, index, sign = _RIGHT.like(b)
+    return b[..., index] * sign
 
 
 def multiply(a: Floats, b: Floats) -> Floats:
@@ -37,7 +38,8 @@ def multiply(a: Floats, b: Floats) -> Floats:
 
 def conjugate(q: Floats) -> Floats:
     """The conjugates of quaternions (..., 4); of unit quaternions, these are the inverse rotations."""
-    return q * _CONJUGATE
+    _, signs = _CONJUGATE.like(q)
+    return q * signs
 
 
 def canonical(q: Floats) -> Floats:
@@ -45,24 +47,30 @@ def canonical(q: Floats) -> Floats:
 
     For half a turn, where w is zero except for rounding, the first component that is not zero becomes positive.
     """
-    w = q[..., :1]
-    if np.count_nonzero(np.abs(w) > _ZERO) == w.size:
-        return q * np.copysign(_ONE, w)
+    xp, zero, one = _ZERO_AND_ONE.like(q)
+    if xp is np:  # a GPU would wait for this question, and saves little by the answer
+        w = q[..., :1]
+        chosen = q * np.copysign(one, w)
+        if np.count_nonzero(chosen[..., 0] > zero) == w.size:
+            return chosen
     # The sign of the first component that does not count as zero.
-    sign = np.copysign(1.0, (q * (np.abs(q) > ZERO)) @ _PRECEDENCE)[..., None]
+    _, precedence = _PRECEDENCE.like(q)
+    sign = xp.copysign(one, xp.vecdot(q * (xp.abs(q) > zero), precedence))[..., None]
     chosen = q * sign
-    chosen[..., 0] = np.abs(chosen[..., 0])
+    chosen[..., 0] = xp.abs(chosen[..., 0])
     return chosen
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:
     """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, with w = Re(a ⊗ conj(b))."""
-    return _TWO * np.arccos(np.minimum(np.abs(np.vecdot(a, b)), _ONE))
+    xp, one, two = _ONE_AND_TWO.like(a)
+    return two * xp.acos(xp.minimum(xp.abs(xp.vecdot(a, b)), one))
 
 
 def normalised(q: Floats) -> Floats:
     """Quaternions (..., 4) scaled to unit length."""
-    return q / np.sqrt((q * q).sum(axis=-1, keepdims=True))
+    xp = namespace(q)
+    return q / xp.sqrt(xp.sum(q * q, axis=-1, keepdims=True))
 
 
 def _outer_product_map() -> tuple[Floats, Floats]:
@@ -84,7 +92,7 @@ def _outer_product_map() -> tuple[Floats, Floats]:
     return linear.reshape(9, 16), constant.reshape(16)
 
 
-_OUTER_LINEAR, _OUTER_CONSTANT = _outer_product_map()
+_OUTER_PRODUCT = Constants(*_outer_product_map())
 
 
 def from_matrix(rotation: Floats) -> Floats:
@@ -93,8 +101,9 @@ def from_matrix(rotation: Floats) -> Floats:
     4 q qᵀ is an affine function of the entries of R. Each of its rows is q times one of its components. The row of the
     largest component is the best conditioned one (Shepperd 1978, "Quaternion from rotation matrix").
     """
-    rows = np.arange(len(rotation))
-    outer = rotation.reshape(-1, 9) @ _OUTER_LINEAR + _OUTER_CONSTANT
-    largest = outer[:, ::5].argmax(axis=-1)  # on the diagonal of 4 q qᵀ
+    xp, linear, constant = _OUTER_PRODUCT.like(rotation)
+    rows = xp.arange(len(rotation), device=rotation.device)
+    outer = rotation.reshape(-1, 9) @ linear + constant
+    largest = xp.argmax(outer[:, ::5], axis=-1)  # on the diagonal of 4 q qᵀ
     row = outer.reshape(-1, 4, 4)[rows, largest]
-    return canonical(row / (2.0 * np.sqrt(row[rows, largest]))[:, None])
+    return canonical(row / (2.0 * xp.sqrt(row[rows, largest]))[:, None])

@@ -100,13 +100,20 @@ def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 @pytest.fixture
 def fake_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Register FakeBackend by an entry point, as another package would, and return its name."""
+    """Register FakeBackend by an entry point, as another package would, and return its name; TensorBackend beside it."""
     package = tmp_path / "gym_mara_fake-0.1.dist-info"
     package.mkdir()
     write(package / "METADATA", "Metadata-Version: 2.1\nName: gym_mara_fake\nVersion: 0.1\n")
     write(
         package / "entry_points.txt",
-        "[gym_mara.backends]\nfake = tests.backends.fake:FakeBackend\n",
+        "[gym_mara.backends]\nfake = tests.backends.fake:FakeBackend\n"
+        "tensors = tests.backends.tensors:TensorBackend\n",
     )
     monkeypatch.syspath_prepend(tmp_path)
     return "fake"
+
+
+@pytest.fixture
+def tensor_backend(fake_backend: str) -> str:
+    """Register TensorBackend and return its name."""
+    return "tensors"

@@ -19,7 +19,16 @@ from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from tests.helpers import ENV_IDS, TASK_NAMES
 
-NOT_NEEDED = ("torch", "stable_baselines3", "matplotlib", "tensorboard", "dartpy", "fcl", "trimesh")
+NOT_NEEDED = (
+    "torch",
+    "array_api_compat.torch",
+    "stable_baselines3",
+    "matplotlib",
+    "tensorboard",
+    "dartpy",
+    "fcl",
+    "trimesh",
+)
 
 
 def _run(code: str, folder: Path) -> str:

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from gym_mara.arrays import is_tensor
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.joint_ranges import action_range
-from gym_mara.types import UnitActions
+from gym_mara.types import Array, UnitActions
 
 
 def action_space(robot: RobotModel) -> Box[np.float32]:
@@ -21,7 +22,7 @@ def action_space(robot: RobotModel) -> Box[np.float32]:
     return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-def joint_targets(action: ArrayLike) -> NDArray[Any]:
+def joint_targets(action: Any) -> NDArray[Any]:
     """Return an action as an array of integers or floats.
 
     Raises:
@@ -30,6 +31,11 @@ def joint_targets(action: ArrayLike) -> NDArray[Any]:
     if type(action) is np.ndarray:
         array = action
     else:
+        if is_tensor(action) and action.device.type != "cpu":
+            raise GymMaraError(
+                f"the action is a tensor on {action.device}, and this environment takes NumPy's arrays: give "
+                "action.cpu().numpy(), or choose a backend that has arrays='torch'"
+            )
         for value in (action, *action) if isinstance(action, Sequence) else (action,):
             if isinstance(value, UnitActions):
                 raise GymMaraError(
@@ -50,3 +56,26 @@ def joint_targets(action: ArrayLike) -> NDArray[Any]:
             f"an action must be an array of integers or floats (joint targets, rad), not of {array.dtype}"
         )
     return array
+
+
+def tensor_targets(action: Any, like: Array) -> Array:
+    """Return an action, which must be a tensor of floats on the device of another tensor, in the float type of that one.
+
+    Raises:
+        GymMaraError: it is an array of another library, on another device, or not of floats.
+    """
+    if not is_tensor(action):
+        raise GymMaraError(
+            f"this environment takes tensors of torch on {like.device}, not a value of type {type(action).__name__}: "
+            f"give torch.as_tensor(actions, device={str(like.device)!r}), or choose arrays='numpy'"
+        )
+    if action.device != like.device:
+        raise GymMaraError(
+            f"the action is a tensor on {action.device}, and this environment is on {like.device}: give "
+            f"actions.to({str(like.device)!r})"
+        )
+    if not action.is_floating_point():
+        raise GymMaraError(
+            f"an action must be a tensor of floats (joint targets, rad), not of {action.dtype}: give actions.float()"
+        )
+    return action.detach().to(like.dtype)

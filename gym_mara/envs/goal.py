@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +12,7 @@ from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 
 from gym_mara import rotations
+from gym_mara.arrays import Constants, contiguous, namespace
 from gym_mara.envs.options import Options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
@@ -21,6 +23,7 @@ from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
 from gym_mara.types import Floats, Mask
 
 REWARD_TYPES = ("sparse", "dense")
+_ONE, _NO_TURN = Constants(1.0), Constants([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class GoalSimulation(Simulation):
 
     def present(self, flat: Floats) -> dict[str, Floats]:
         """The groups of flat observations (…, O) by name."""
-        return {name: np.ascontiguousarray(flat[..., own]) for name, own in self._columns.items()}
+        return {name: contiguous(flat[..., own]) for name, own in self._columns.items()}
 
     def _reward(
         self, state: SimState, observation: Floats
@@ -97,7 +100,7 @@ class GoalSimulation(Simulation):
         )
         success = self._succeeds(achieved, desired)
         if self._settings.reward_type == "sparse":
-            reward = success - 1.0
+            reward = self._sparse(success, achieved)
         else:
             reward = self._dense(achieved, desired, state.collided)
         return reward, terms | {"is_success": success}
@@ -105,8 +108,9 @@ class GoalSimulation(Simulation):
     def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
         """The rewards of goals, as in MaraGoalEnv."""
         if self._settings.reward_type == "sparse":
-            return self._succeeds(achieved, desired) - 1.0
-        collided = np.zeros(len(np.atleast_2d(achieved)), np.bool_)
+            return self._sparse(self._succeeds(achieved, desired), achieved)
+        rows = (-1, achieved.shape[-1])
+        collided: Mask = np.zeros(math.prod(achieved.shape[:-1]), np.bool_)
         if self._reach.collision_penalty:
             infos = [info] if isinstance(info, Mapping) else list(info)
             if not all("collided" in one for one in infos):
@@ -114,8 +118,14 @@ class GoalSimulation(Simulation):
                     "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
                 )
             collided = np.array([one["collided"] for one in infos])
-        reward = self._dense(np.atleast_2d(achieved), np.atleast_2d(desired), collided)
-        return reward.reshape(np.shape(achieved)[:-1])
+        collided = namespace(achieved).asarray(collided, device=achieved.device)
+        reward = self._dense(achieved.reshape(rows), desired.reshape(rows), collided)
+        return reward.reshape(achieved.shape[:-1])
+
+    def _sparse(self, success: Any, achieved: Floats) -> Any:
+        """0 for the goals that are reached, -1 for the others, in the float type of the goals."""
+        _, one = _ONE.like(achieved)
+        return success * one - one
 
     def _dense(self, achieved: Floats, desired: Floats, collided: Mask) -> Floats:
         """The rewards (N,) of the task for goals (N, G)."""
@@ -124,7 +134,8 @@ class GoalSimulation(Simulation):
 
     def _succeeds(self, achieved: Floats, desired: Floats) -> Any:
         """Which goals (…, G) are reached."""
-        away = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
+        xp, error = namespace(achieved), achieved[..., :3] - desired[..., :3]
+        away = xp.sqrt(xp.sum(error * error, axis=-1))
         near = away <= self._settings.position_tolerance
         if self._reach.orientation:
             angle = rotations.angle_between(achieved[..., 3:], desired[..., 3:])
@@ -135,7 +146,8 @@ class GoalSimulation(Simulation):
         """The positions (N, 3) and the quaternions (N, 4) of goals (N, G)."""
         if self._reach.orientation:
             return goal[:, :3], goal[:, 3:]
-        return goal, np.tile([1.0, 0.0, 0.0, 0.0], (len(goal), 1))
+        xp, no_turn = _NO_TURN.like(goal)
+        return goal, xp.tile(no_turn, (len(goal), 1))
 
 
 class _GoalEnv:

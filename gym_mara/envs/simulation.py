@@ -13,8 +13,9 @@ from gymnasium.spaces import Space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
+from gym_mara.arrays import host, namespace, zeros_like
 from gym_mara.backends import backend_settings, make_backend
-from gym_mara.envs.actions import action_space, joint_targets
+from gym_mara.envs.actions import action_space, joint_targets, tensor_targets
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import Sensors
 from gym_mara.envs.statistics import EpisodeStatistics
@@ -24,11 +25,11 @@ from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
-from gym_mara.types import Floats, Mask
+from gym_mara.types import Array, Floats, Mask
 
 
 class Outcome(NamedTuple):
-    """The result of one step, per arm."""
+    """The result of one step, per arm, in the backend's arrays."""
 
     observation: Floats
     """The observations (N, O); for an arm that collided, from its colliding configuration."""
@@ -48,6 +49,9 @@ class Outcome(NamedTuple):
 class Simulation:
     """N arms of one robot, moved by one backend, judged by one task.
 
+    Actions, observations and all other arrays are the backend's (`Backend.arrays`): those of NumPy, or tensors, which no step
+    copies from or to the host. `observation_space`, `action_space`, `target_low`, `target_high` and snapshots are NumPy's.
+
     Args:
         options: the task, the robot, the backend and their settings.
         num_envs: N.
@@ -64,18 +68,26 @@ class Simulation:
         self.backend_name = options.backend
         self.backend = make_backend(options.backend, self.robot, self.num_envs, options.settings)
         self._workspace = RobotWorkspace(self.robot)
-        self.goal = self.task.goal(self.robot, self._workspace, self.num_envs)
+        asarray = self.backend.asarray
+        goal = self.task.goal(self.robot, self._workspace, self.num_envs)
+        self.goal = Goal(asarray(goal.position), asarray(goal.quaternion))
         start = self.robot.home if self.task.start_q is None else self.task.start_q
-        self._start = np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1))
+        self._start = asarray(np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1)))
+        # A tensor of the backend's type and device; None with NumPy's arrays.
+        self._tensor = None if self.backend.arrays == "numpy" else self._start
         self._started = False
         self._closed = False
         self.outcome: Outcome | None = None
         """The outcome of the last step."""
         # The arms that began an episode after the last step.
-        self._began = np.zeros(self.num_envs, np.bool_)
-        self.statistics = EpisodeStatistics(self.num_envs)
+        self._began = asarray(np.zeros(self.num_envs, np.bool_))
+        self.statistics = EpisodeStatistics(self.num_envs, self._tensor)
         self.streams: Sequence[Streams] = ()
         """The random generators of each arm; needed if `random` is true."""
+        if self._tensor is not None and _sensor_noise(self.backend.state) is not None:
+            raise GymMaraError(
+                "the sensors' noise is drawn on the host: leave out randomisation={'sensor_noise': …}, or choose arrays='numpy'"
+            )
         if options.sensors.velocity_filter and _sensor_noise(self.backend.state) is None:
             raise GymMaraError(
                 "velocity_filter smooths the velocity of noisy sensors, and these are exact: on a backend that has "
@@ -83,17 +95,21 @@ class Simulation:
             )
         self._sensors = self._new_sensors()
         self.observation = Observation(
-            self.task.observation(self.robot, self.goal, self.backend.joint_velocity),
+            self.task.observation(self.robot, goal, self.backend.joint_velocity),
             self.backend.overshoot,
         )
         overshoot = self.backend.overshoot
-        self._observed_range = self.robot.lower - overshoot, self.robot.upper + overshoot
+        self._observed_range = (
+            asarray(self.robot.lower - overshoot),
+            asarray(self.robot.upper + overshoot),
+        )
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
         self.action_space = action_space(self.robot)
         # The range of joint targets: the intersection of the action space and the joint limits, rad (m).
         self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
         self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
+        self._target_range = asarray(self.target_low), asarray(self.target_high)
 
     @property
     def random(self) -> bool:
@@ -107,28 +123,40 @@ class Simulation:
             The observations (N, O); and torques, contacts and random parameters, each (N, …), if the state has them.
         """
         self._check_open()
-        chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
-        if self.backend.random:
-            seeds = np.zeros(self.num_envs, np.uint64)
-            for index in np.flatnonzero(chosen).tolist():
-                seeds[index] = self.streams[index].parameters.integers(2**63)
-            self.backend.begin_episodes(seeds, chosen)
-        if self.task.random_goal:
-            position, quaternion = self.goal.position.copy(), self.goal.quaternion.copy()
-            for index in np.flatnonzero(chosen).tolist():
-                drawn = self.task.draw_goal(self._workspace, self.streams[index].goals)
-                position[index], quaternion[index] = drawn
-            self.goal = Goal(position, quaternion)
+        if self.random:
+            self._draw(np.ones(self.num_envs, np.bool_) if mask is None else host(mask))
         self.backend.reset(self._start, mask)
-        self.statistics.clear(slice(None) if mask is None else mask)
+        chosen = slice(None) if mask is None else mask
+        self.statistics.clear(chosen)
         self._started = True
         self._began[chosen] = True
         state = self.backend.state
         noise = _sensor_noise(state)
         if noise is not None:
-            self._sensors.begin_episodes(self.streams, chosen)
-            self._sensors.begin(self._start, noise, chosen)
+            arms = np.ones(self.num_envs, np.bool_) if mask is None else mask
+            self._sensors.begin_episodes(self.streams, arms)
+            self._sensors.begin(self._start, noise, arms)
         return self._observe(state, noise), _report(state)
+
+    def _draw(self, chosen: Mask) -> None:
+        """Draw the random parameters and goals of new episodes; the mask (N,) is NumPy's, because each arm has its generators."""
+        arms = np.flatnonzero(chosen).tolist()
+        if self.backend.random:
+            seeds = np.zeros(self.num_envs, np.uint64)
+            for index in arms:
+                seeds[index] = self.streams[index].parameters.integers(2**63)
+            self.backend.begin_episodes(seeds, chosen)
+        if self.task.random_goal:
+            position, quaternion = np.zeros((self.num_envs, 3)), np.zeros((self.num_envs, 4))
+            for index in arms:
+                drawn = self.task.draw_goal(self._workspace, self.streams[index].goals)
+                position[index], quaternion[index] = drawn
+            asarray, old = self.backend.asarray, self.goal
+            xp, rows = namespace(old.position), asarray(chosen)[:, None]
+            self.goal = Goal(
+                xp.where(rows, asarray(position), old.position),
+                xp.where(rows, asarray(quaternion), old.quaternion),
+            )
 
     def step(self, action: ArrayLike) -> Outcome:
         """Move every arm towards its joint targets (N, J), rad, for one control period.
@@ -141,8 +169,9 @@ class Simulation:
         self._check_open()
         if not self._started:
             raise ResetNeeded("call reset() before the first step()")
-        state = self.backend.step(self._target(action))
-        self._began.fill(False)
+        xp = namespace(self._start)
+        state = self.backend.step(self._target(action, xp))
+        self._began[...] = False
         noise = _sensor_noise(state)
         if noise is not None:
             self._sensors.measure(state.q, noise)
@@ -152,14 +181,14 @@ class Simulation:
         collided = state.collided
         if self.task.on_collision == "terminate":
             terminated = terminated | collided
-        elif self.task.on_collision == "reset" and (count := np.count_nonzero(collided)):
+        elif self.task.on_collision == "reset" and (count := xp.count_nonzero(collided)):
             self.backend.reset(self._start, None if count == self.num_envs else collided)
             if noise is not None:
                 self._sensors.begin(self._start, noise, collided)
-        distance = terms["distance"] if "distance" in terms else np.full(self.num_envs, np.nan)
+        distance = terms["distance"] if "distance" in terms else zeros_like(reward) + np.nan
         self.statistics.add(distance, reward, collided)
         diverged = state.diverged
-        truncated = diverged if diverged is not None and np.count_nonzero(diverged) else None
+        truncated = diverged if diverged is not None and xp.count_nonzero(diverged) else None
         info = {**terms, "collided": collided, **_report(state)}
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
@@ -196,8 +225,8 @@ class Simulation:
         if not np.linalg.norm(turn) > 1e-6:
             raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
         turn = rotations.canonical(rotations.normalised(turn))
-        shape = (self.num_envs, 1)
-        self.goal = Goal(np.tile(point, shape), np.tile(turn, shape))
+        asarray, shape = self.backend.asarray, (self.num_envs, 1)
+        self.goal = Goal(asarray(np.tile(point, shape)), asarray(np.tile(turn, shape)))
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.
@@ -212,6 +241,11 @@ class Simulation:
         known = backend_settings(name)
         settings = {key: v for key, v in self.options.settings.items() if key in known}
         backend = make_backend(name, self.robot, self.num_envs, settings)
+        if (backend.arrays, self.backend.arrays) != ("numpy", "numpy"):
+            backend.close()
+            raise GymMaraError(
+                "a simulation of tensors stays in its backend; make a new environment"
+            )
         everyone = np.ones(self.num_envs, np.bool_)
         if backend.random:
             if not self._started:
@@ -248,20 +282,25 @@ class Simulation:
             state = dataclasses.replace(state, q=state.q.clip(*self._observed_range))
         return self.observation(state, self.goal)
 
-    def _target(self, action: ArrayLike) -> Floats:
+    def _target(self, action: ArrayLike, xp: Any) -> Floats:
         """The joint targets of an action, clipped to the range of joint targets."""
-        target = joint_targets(action).astype(np.float64, copy=False)
-        if target.shape != self._start.shape:
+        if self._tensor is None:
+            target: Array = joint_targets(action).astype(np.float64, copy=False)
+        else:
+            target = tensor_targets(action, self._tensor)
+        needed = self._start.shape
+        if target.shape != needed:
+            own = slice(1 if self.num_envs == 1 else 0, None)
             raise GymMaraError(
-                f"the action has shape {target.shape[1:] if self.num_envs == 1 else target.shape}; "
-                f"{self.robot.name} needs {self._start.shape[1:] if self.num_envs == 1 else self._start.shape}"
+                f"the action has shape {(*target.shape,)[own]}; {self.robot.name} needs {(*needed,)[own]}"
             )
-        if np.count_nonzero(np.isfinite(target)) < target.size:
+        if xp.count_nonzero(xp.isfinite(target)) < needed[0] * needed[1]:
             raise GymMaraError(
                 "the action contains NaN or infinity; joint targets must be finite (rad)"
             )
         # In half the time of target.clip for one arm.
-        return np.minimum(np.maximum(target, self.target_low), self.target_high)
+        low, high = self._target_range
+        return xp.minimum(xp.maximum(target, low), high)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -272,12 +311,15 @@ class Simulation:
         return {
             "made_with": self._made_with(),
             "backend": self.backend.save(),
-            "statistics": copy.deepcopy(self.statistics),
+            "statistics": self.statistics.copy(),
             "sensors": self._sensors.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
-            "goal": (self.goal.position, self.goal.quaternion),
+            "goal": self._host_goal(),
         }
+
+    def _host_goal(self) -> tuple[Floats, Floats]:
+        return host(self.goal.position), host(self.goal.quaternion)
 
     def check_snapshot(self, snapshot: Any, others: dict[str, Any]) -> None:
         """Check that a snapshot fits this simulation, except for what the backend checks itself.
@@ -306,10 +348,11 @@ class Simulation:
             "sensors": sensors,
             "streams": tuple,
             "started": bool,
-            "goal": (self.goal.position, self.goal.quaternion),
+            "goal": self._host_goal(),
         }
         check_fits("snapshot", snapshot, form | others)
-        check_fits("statistics.steps", snapshot["statistics"].steps, self.statistics.steps)
+        steps = host(self.statistics.steps)
+        check_fits("statistics.steps", snapshot["statistics"].steps, steps)
         arms = snapshot["sensors"]["generators"].keys() & range(count)
         check_fits("generators", snapshot["sensors"]["generators"], dict.fromkeys(arms, drawn))
         of_arm = Streams(*[drawn] * len(Streams._fields))  # type: ignore[arg-type]
@@ -327,12 +370,12 @@ class Simulation:
             GymMaraError: the backend's part does not fit. Nothing has changed then.
         """
         self.backend.restore(snapshot["backend"])
-        self.statistics = copy.deepcopy(snapshot["statistics"])
+        self.statistics = snapshot["statistics"].copy(self._tensor)
         self._sensors.restore(snapshot["sensors"])
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         self.outcome = None
-        self.goal = Goal(*(values.copy() for values in snapshot["goal"]))
+        self.goal = Goal(*(self.backend.asarray(values.copy()) for values in snapshot["goal"]))
 
     def close(self) -> None:
         """Free the backend. A second call has no effect."""

@@ -17,7 +17,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.time_limits import TimeLimits
 from gym_mara.envs.view import view_of
-from gym_mara.errors import one_of
+from gym_mara.errors import GymMaraError, one_of
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import Task
@@ -63,6 +63,11 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         self.render_mode = checked_render_mode(render_mode, self.metadata["render_modes"])
         self._options = Options.sort(task, robot, ee_frame, backend, options, type(self))
         self.simulation = self._make_simulation(self._options)
+        if self.simulation.backend.arrays != "numpy":
+            self.simulation.close()
+            raise GymMaraError(
+                "an environment of one arm has NumPy's arrays: leave out arrays, or make a vector environment with make_vec"
+            )
         self._pictures = Pictures(self.simulation.robot, self._options.rendering)
         self.viewer: Viewer | None = None
         self._time_limits = TimeLimits()

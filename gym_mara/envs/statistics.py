@@ -7,13 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gym_mara.arrays import host, is_tensor, namespace
+from gym_mara.types import Array, Floats, Mask
 
 
 class EpisodeStatistics:
     """The largest, mean and smallest distance and reward, and the number of collisions, of N running episodes.
 
     The names are those of gym-gazebo2. The distance is the root mean square of the position error over x, y and z, m.
+
+    Args:
+        num_envs: N.
+        like: a tensor, for statistics that are tensors of its type and on its device; None for NumPy's arrays.
     """
 
     NAMES = (
@@ -27,12 +32,16 @@ class EpisodeStatistics:
         "num_coll",
     )
 
-    def __init__(self, num_envs: int) -> None:
-        # One row per name. The rows of means hold sums; the rows of steps and collisions hold counts.
-        self._values = np.zeros((len(self.NAMES), num_envs))
+    def __init__(self, num_envs: int, like: Array | None = None) -> None:
+        xp = namespace(like)
+        device = None if like is None else like.device
+        self._dtype = xp.float64 if like is None else like.dtype
+        # In float64 always: sums over an episode lose digits, and float32 counts no further than 16 million steps. One row
+        # per name. The rows of means hold sums; the rows of steps and collisions hold counts.
+        self._values = xp.zeros((len(self.NAMES), num_envs), dtype=xp.float64, device=device)
         self._max, self._min, self._sum = self._values[0:2], self._values[2:4], self._values[4:8]
         # The distance, the reward, the count 1 and the collision of one step.
-        self._step = np.ones((4, num_envs))
+        self._step = xp.ones((4, num_envs), dtype=xp.float64, device=device)
         self._extremes = self._step[:2]
         self.clear(slice(None))
 
@@ -41,14 +50,15 @@ class EpisodeStatistics:
         """The number of steps of each episode so far (N,)."""
         return self._values[6]
 
-    def add(self, distance: Floats, reward: Floats, collided: NDArray[np.bool_]) -> None:
+    def add(self, distance: Floats, reward: Floats, collided: Mask) -> None:
         """Add one step of every episode. All arrays are (N,); the distance is in m."""
+        xp = namespace(self._step)
         self._step[0], self._step[1], self._step[3] = distance, reward, collided
-        np.maximum(self._max, self._extremes, out=self._max)
-        np.minimum(self._min, self._extremes, out=self._min)
+        xp.maximum(self._max, self._extremes, out=self._max)
+        xp.minimum(self._min, self._extremes, out=self._min)
         self._sum += self._step
 
-    def clear(self, chosen: NDArray[np.bool_] | slice) -> None:
+    def clear(self, chosen: Mask | slice) -> None:
         """Start new statistics for the chosen episodes."""
         self._values[:, chosen] = 0.0
         self._max[:, chosen] = -np.inf
@@ -56,12 +66,14 @@ class EpisodeStatistics:
 
     def summary(self) -> dict[str, NDArray[Any]]:
         """The statistics of every episode so far, each (N,)."""
-        values = self._values.copy()
-        values[4:6] /= np.maximum(values[6], 1.0)
-        summary: dict[str, NDArray[Any]] = dict(zip(self.NAMES, values, strict=True))
-        for name in ("ep_steps", "num_coll"):
-            summary[name] = summary[name].astype(np.int64)
-        return summary
+        xp = namespace(self._values)
+        values = xp.asarray(self._values, copy=True)
+        values[4:6] /= values[6].clip(1.0)
+        counts = ("ep_steps", "num_coll")
+        return {
+            name: xp.asarray(row, dtype=xp.int64 if name in counts else self._dtype)
+            for name, row in zip(self.NAMES, values, strict=True)
+        }
 
     def of(self, index: int) -> dict[str, float]:
         """The statistics of one episode so far, as plain numbers."""
@@ -70,11 +82,18 @@ class EpisodeStatistics:
         values += [dist_sum / count, rew_sum / count, int(steps), int(collisions)]
         return dict(zip(self.NAMES, values, strict=True))
 
+    def copy(self, like: Array | None = None) -> EpisodeStatistics:
+        """A copy in the library and on the device of another array; in NumPy's arrays without one."""
+        return _restored(host(self._values), like)
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._values,)
+        if not is_tensor(self._values):
+            return _restored, (self._values,)
+        like = self._values.new_empty(0, dtype=self._dtype)
+        return _restored, (host(self._values), like)
 
 
-def _restored(values: Floats) -> EpisodeStatistics:
-    statistics = EpisodeStatistics(values.shape[1])
-    statistics._values[...] = values
+def _restored(values: Floats, like: Array | None = None) -> EpisodeStatistics:
+    statistics = EpisodeStatistics(values.shape[1], like)
+    statistics._values[...] = namespace(like).asarray(values)
     return statistics

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from gym_mara.arrays import host, is_tensor, namespace
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Outcome, Simulation
@@ -21,7 +22,7 @@ from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import MAX_EPISODE_STEPS, Task
-from gym_mara.types import Floats, Mask
+from gym_mara.types import Array, Floats, Mask
 
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
@@ -29,6 +30,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     `info` has the keys of MaraEnv in Gymnasium's format for vector environments. `statistics` appear only at the last
     step of an episode. Keys with values of the same arms share one mask array.
+
+    With a backend of tensors (`arrays="torch"`) actions, observations, rewards, flags, masks and all values of `info` are
+    tensors on its device, and `final_obs` is one of shape (N, O). The spaces are Gymnasium's, so their samples are NumPy's.
 
     Args:
         num_envs: N.
@@ -78,7 +82,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "autoreset_mode": self.autoreset_mode,
         }
         self._pictures = Pictures(self.simulation.robot, sorted_options.rendering)
-        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._ended = self.simulation.backend.asarray(np.zeros(self.num_envs, dtype=np.bool_))
         # A copy of the last observations (N, O), which a reset with a mask returns for the other arms.
         self._last: Floats | None = None
         self.closed = False
@@ -103,21 +107,39 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         seeds = self._seeds(seed)
         mask = (options or {}).get("reset_mask")
         if mask is not None:
-            mask = np.asarray(mask)
-            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-                raise GymMaraError(
-                    f"reset_mask must be bool, of shape {(self.num_envs,)}, and select at least one arm"
-                )
+            mask = self._checked(mask)
         super().reset(seed=seeds[0])
-        chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
-        self._ended[chosen] = False
+        xp = namespace(self._ended)
+        chosen = xp.ones_like(self._ended) if mask is None else mask
+        self._ended = self._ended & ~chosen
         if self.simulation.random:
-            self._seed(seeds, chosen)
+            self._seed(seeds, host(chosen))
         observation, report = self.simulation.reset(mask)
         if mask is not None and self._last is not None:
-            observation = np.where(mask[:, None], observation, self._last)
-        self._last = observation.copy()
+            observation = xp.where(mask[:, None], observation, self._last)
+        self._last = xp.asarray(observation, copy=True)
         return self.simulation.present(observation), _vector_info(report, chosen)
+
+    def _checked(self, mask: Any) -> Mask:
+        """The mask of a reset, in the backend's arrays.
+
+        Raises:
+            GymMaraError: it is no mask, or selects no arm.
+        """
+        like = self._ended
+        if not is_tensor(like):
+            mask, where = host(mask), ""
+        else:
+            where = f" a tensor on {like.device},"
+        if is_tensor(like) and not (is_tensor(mask) and mask.device == like.device):
+            fits = False
+        else:
+            fits = mask.shape == like.shape and mask.dtype == like.dtype and bool(mask.any())
+        if not fits:
+            raise GymMaraError(
+                f"reset_mask must be{where} bool, of shape {(self.num_envs,)}, and select at least one arm"
+            )
+        return mask
 
     def _seeds(self, seed: Any) -> list[int | None]:
         """The seed of each arm.
@@ -160,7 +182,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
                 moves then.
         """
         resetting = self._ended
-        some_reset = bool(np.count_nonzero(resetting))
+        xp = namespace(resetting)
+        some_reset = bool(xp.count_nonzero(resetting))
         if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
             raise GymMaraError(
                 "episodes have ended: call reset(options={'reset_mask': …}) for them before the next step"
@@ -174,20 +197,20 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         stepped = ~resetting
         if some_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
             first, report = self.simulation.reset(resetting)
-            observation = np.where(resetting[:, None], first, observation)
-            reward = np.where(resetting, 0.0, reward)
+            observation = xp.where(resetting[:, None], first, observation)
+            reward = xp.where(resetting, 0.0, reward)
             terminated, truncated = terminated & stepped, truncated & stepped
         info = _vector_info(outcome.info, stepped)
         if some_reset:
             _add_rows(info, report, resetting)
         ended = terminated | truncated
-        if np.count_nonzero(ended):
+        if xp.count_nonzero(ended):
             info |= _vector_info({"statistics": self.simulation.statistics.summary()}, ended)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 observation, info = self._begin_next(outcome, info, ended)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            self._ended = ended.copy()
-        self._last = observation.copy()
+            self._ended = xp.asarray(ended, copy=True)
+        self._last = xp.asarray(observation, copy=True)
         return self.simulation.present(observation), reward, terminated, truncated, info
 
     def _begin_next(
@@ -203,16 +226,23 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         Returns:
             The observations (N, O), which for these arms are the first of their new episodes, and the info.
         """
-        last = np.full(self.num_envs, None, dtype=object)
-        for index in np.flatnonzero(ended):
-            last[index] = self.simulation.present(outcome.observation[index].copy())
         info = _vector_info(outcome.info, ~ended)
-        info |= {"final_obs": last, "_final_obs": ended}
+        info |= {"final_obs": self._final(outcome.observation, ended), "_final_obs": ended}
         final = {key: value for key, value in final.items() if key[0] != "_"}
         info |= _vector_info({"final_info": final}, ended)
         first, report = self.simulation.reset(ended)
         _add_rows(info, report, ended)
-        return np.where(ended[:, None], first, outcome.observation), info
+        return namespace(ended).where(ended[:, None], first, outcome.observation), info
+
+    def _final(self, observation: Floats, ended: Mask) -> Any:
+        """The observations of the ended arms: N objects of Gymnasium's format, or one tensor (N, O), zero for other arms."""
+        if is_tensor(observation):
+            final = namespace(ended).where(ended[:, None], observation, _absent(observation))
+            return self.simulation.present(final)
+        last = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended):
+            last[index] = self.simulation.present(observation[index].copy())
+        return last
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Draw each arm in the state of its last observation: uint8 (height, width, 3), RGB; None without render_mode.
@@ -228,8 +258,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def save_state(self) -> dict[str, Any]:
         """A snapshot of the arms, the episodes and the random generators; it can be pickled."""
         return self.simulation.save() | {
-            "ended": self._ended.copy(),
-            "last": copy.copy(self._last),
+            "ended": np.array(host(self._ended)),
+            "last": None if self._last is None else np.array(host(self._last)),
             "np_random": copy.deepcopy(self.np_random),
         }
 
@@ -243,7 +273,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.simulation.check_snapshot(
             snapshot,
             {
-                "ended": self._ended,
+                "ended": host(self._ended),
                 "last": type(None)
                 if last is None
                 else np.zeros((self.num_envs, *self.simulation.observation.space.shape)),
@@ -251,8 +281,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             },
         )
         self.simulation.restore(snapshot)
-        self._ended = snapshot["ended"].copy()
-        self._last = copy.copy(snapshot["last"])
+        asarray = self.simulation.backend.asarray
+        self._ended = asarray(snapshot["ended"].copy())
+        self._last = None if last is None else asarray(last.copy())
         self.np_random = copy.deepcopy(snapshot["np_random"])
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -271,7 +302,8 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Convert infos to Gymnasium's format for vector environments: the mask `_key` marks the arms that have a `key`."""
     info: dict[str, Any] = {}
-    everyone = np.count_nonzero(mask) == len(mask)
+    xp = namespace(mask)
+    everyone = xp.count_nonzero(mask) == len(mask)
     for key, value in values.items():
         if isinstance(value, dict):
             nested = {k: v for k, v in value.items() if not k.startswith("_")}
@@ -279,8 +311,7 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
         elif everyone:
             info[key] = value
         else:
-            absent = np.array(None) if value.dtype == object else np.zeros((), value.dtype)
-            info[key] = np.where(_rows(mask, value), value, absent)
+            info[key] = xp.where(_rows(mask, value), value, _absent(value))
         info[f"_{key}"] = mask
     return info
 
@@ -288,8 +319,15 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
 def _add_rows(info: dict[str, Any], values: dict[str, NDArray[Any]], arms: Mask) -> None:
     """Add the values of some arms to an info that has the values of other arms."""
     for key, value in values.items():
-        info[key] = np.where(_rows(arms, value), value, info[key])
+        info[key] = namespace(arms).where(_rows(arms, value), value, info[key])
         info[f"_{key}"] = info[f"_{key}"] | arms
+
+
+def _absent(value: Array) -> Array:
+    """The value of an arm that has none: None or zero."""
+    if is_tensor(value):
+        return value.new_zeros(())
+    return np.array(None) if value.dtype == object else np.zeros((), value.dtype)
 
 
 def _rows(mask: Mask, value: NDArray[Any]) -> Mask:

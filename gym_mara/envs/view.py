@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gym_mara.arrays import host
 from gym_mara.envs.simulation import Simulation
 from gym_mara.rendering.view import View
 
@@ -9,6 +10,7 @@ from gym_mara.rendering.view import View
 def view_of(simulation: Simulation, arm: int) -> View:
     """The View of an arm in the state of its last observation: after a collision, it shows the colliding state."""
     state, goal = simulation.observed(arm), simulation.goal
+    q = host(state.q[arm])
     touching: frozenset[str] = frozenset()
     if state.collided[arm]:
         if state.contacts is not None:
@@ -16,5 +18,5 @@ def view_of(simulation: Simulation, arm: int) -> View:
         if not touching:
             from gym_mara.collision.coal import touching_links
 
-            touching = touching_links(simulation.robot, state.q[arm])
-    return View(state.q[arm], goal.position[arm], goal.quaternion[arm], touching)
+            touching = touching_links(simulation.robot, q)
+    return View(q, host(goal.position[arm]), host(goal.quaternion[arm]), touching)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
+from gym_mara.arrays import zeros_like
 from gym_mara.errors import finite_numbers, one_of
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
@@ -102,4 +103,4 @@ class Task(ABC):
 
     def terminated(self, state: SimState, goal: Goal) -> Mask:
         """The arms (N,) whose episodes the task terminates. The environment handles collisions."""
-        return np.zeros(len(state.q), dtype=np.bool_)
+        return zeros_like(state.collided)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from gym_mara import rotations
+from gym_mara.arrays import contiguous, namespace
 from gym_mara.types import Floats
 
 
@@ -23,8 +22,9 @@ class Goal:
     @cached_property
     def _inverse(self) -> Floats:
         # Contiguous: the last bits of a dot product depend on the memory layout, which a copy of it could change.
-        return np.ascontiguousarray(rotations.right_matrix(rotations.conjugate(self.quaternion)))
+        return contiguous(rotations.right_matrix(rotations.conjugate(self.quaternion)))
 
     def orientation_error(self, quaternion: Floats) -> Floats:
         """The rotation from the goal to the end effector: q ⊗ conj(goal) (N, 4), w >= 0, for orientations q (N, 4)."""
-        return rotations.canonical(np.vecdot(self._inverse, quaternion[..., None, :]))
+        xp = namespace(quaternion)
+        return rotations.canonical(xp.vecdot(self._inverse, quaternion[..., None, :]))

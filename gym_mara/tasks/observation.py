@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium.spaces import Box
 
+from gym_mara.arrays import namespace
 from gym_mara.errors import GymMaraError
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
@@ -72,7 +73,8 @@ class Observation:
 
     def __call__(self, state: SimState, goal: Goal) -> Floats:
         """Compute the flat observations (N, O) of N arms, a fresh array."""
-        return np.concatenate([values(state, goal) for values in self._values], axis=-1)
+        parts = [values(state, goal) for values in self._values]
+        return namespace(state.q).concat(parts, axis=-1)
 
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gym_mara import rotations
+from gym_mara.arrays import Constants, zeros_like
 from gym_mara.errors import GymMaraError, flag, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
@@ -32,8 +33,8 @@ _RANGES = {
     "eta": (1e-9, 1e3, True),
     "kappa": (1e-3, 1e3, False),
 }
-# Arrays, because a NumPy ufunc on one row takes twice as long with a Python number.
-_ONE, _RMS = np.array(1.0), np.array(3.0**-0.5)
+# The second takes the Euclidean norm of three components to their root mean square.
+_ONE_AND_RMS = Constants(1.0, 3.0**-0.5)
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,9 @@ class ReachTask(Task):
     ) -> tuple[Floats, dict[str, Floats]]:
         """The reward and its terms, as in `reward`, of end effectors at positions (N, 3), m, and quaternions (N, 4)."""
         error = position - goal.position
-        position_error = np.sqrt(np.vecdot(error, error))
-        distance = position_error * _RMS
+        xp, one, rms = _ONE_AND_RMS.like(error)
+        position_error = xp.sqrt(xp.vecdot(error, error))
+        distance = position_error * rms
         angle = rotations.angle_between(quaternion, goal.quaternion)
         near = rewards.distance_reward(distance, self.alpha, self.kappa)
         aligned = collision = None
@@ -139,7 +141,7 @@ class ReachTask(Task):
             aligned = rewards.orientation_factor(angle, self.beta, self.gamma)
         if self.collision_penalty:
             collision = rewards.collision_penalty(collided, distance, self.delta, self.eta)
-        total = (near if aligned is None else near * aligned) - _ONE
+        total = (near if aligned is None else near * aligned) - one
         if collision is not None:
             total -= collision
         return total, {
@@ -147,8 +149,8 @@ class ReachTask(Task):
             "position_error": position_error,
             "angle_error": angle,
             "reward_distance": near,
-            "reward_orientation": np.ones(len(near)) if aligned is None else aligned,
-            "reward_collision": np.zeros(len(near)) if collision is None else collision,
+            "reward_orientation": zeros_like(near) + one if aligned is None else aligned,
+            "reward_collision": zeros_like(near) if collision is None else collision,
         }
 
 
