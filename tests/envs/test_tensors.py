@@ -369,7 +369,7 @@ def test_set_goal_moves_the_goal_to_the_device(pair: Make) -> None:
     _assert_same(tensors, arrays, "float64")
 
 
-class _HostReads(TorchDispatchMode):
+class _HostReads(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts how often a number is read from a tensor, for which a program waits until a GPU has done all its work."""
 
     count = 0
