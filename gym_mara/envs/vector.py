@@ -303,7 +303,8 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Convert infos to Gymnasium's format for vector environments: the mask `_key` marks the arms that have a `key`."""
     info: dict[str, Any] = {}
     xp = namespace(mask)
-    everyone = xp.count_nonzero(mask) == len(mask)
+    # A number of the host: a GPU would be waited for at each key.
+    everyone = bool(xp.count_nonzero(mask) == len(mask))
     for key, value in values.items():
         if isinstance(value, dict):
             nested = {k: v for k, v in value.items() if not k.startswith("_")}

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gym_mara.arrays import host
 from gym_mara.envs import MaraEnv, MaraVectorEnv
@@ -366,3 +367,25 @@ def test_set_goal_moves_the_goal_to_the_device(pair: Make) -> None:
         seen.append(env.reset()[0])
     tensors, arrays = seen
     _assert_same(tensors, arrays, "float64")
+
+
+class _HostReads(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Counts how often a number is read from a tensor, for which a program waits until a GPU has done all its work."""
+
+    count = 0
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        self.count += function is torch.ops.aten._local_scalar_dense.default
+        return function(*args, **(kwargs or {}))
+
+
+def test_a_step_waits_for_the_device_a_few_times_whatever_the_infos(pair: Make) -> None:
+    tensors, _ = pair(autoreset_mode="SameStep", max_episode_steps=100)
+    tensors.reset(seed=0)
+    actions = list(_actions(5))
+    with _HostReads() as reads:  # type: ignore[no-untyped-call]
+        for each in actions:
+            tensors.step(each)
+    assert reads.count <= 6 * len(actions)
