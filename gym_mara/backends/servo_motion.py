@@ -16,6 +16,8 @@ MOST_PHYSICS_STEPS = 10_000
 def has_diverged(q: Floats, qd: Floats, velocity_limit: Floats) -> Mask:
     """Which arms have a state, q and q̇ (..., J), that is not finite or is far beyond the velocity limits (J,)."""
     sane = np.isfinite(q) & (np.abs(qd) < DIVERGED_VELOCITY * velocity_limit)
+    if np.count_nonzero(sane) == sane.size:
+        return np.zeros(sane.shape[:-1], np.bool_)
     return np.logical_not(np.logical_and.reduce(sane, axis=-1))
 
 

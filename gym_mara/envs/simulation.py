@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -276,10 +275,11 @@ class Simulation:
         """The observations (N, O) of a state; if there is noise, of what the sensors have measured."""
         if noise is not None:
             state = self._sensors.seen(state)
-        if (
-            self.backend.overshoot
-        ):  # an impact may take a joint further, but the observation stays in its space
-            state = dataclasses.replace(state, q=state.q.clip(*self._observed_range))
+        if self.backend.overshoot:
+            # An impact may take a joint further, but the observation stays in its space.
+            low, high = self._observed_range
+            xp = namespace(low)
+            state = state.with_q(xp.minimum(xp.maximum(state.q, low), high))
         return self.observation(state, self.goal)
 
     def _target(self, action: ArrayLike, xp: Any) -> Floats:

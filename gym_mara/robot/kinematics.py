@@ -71,16 +71,26 @@ class Kinematics:
         return product[:, :3, 3].copy(), rotations.from_matrix(product[:, :3, :3])
 
     def _pose_one_by_one(self, q: Floats) -> tuple[Floats, Floats]:
-        poses, half_turns = [], False
+        placements = []
         for configuration in q:
             pin.forwardKinematics(self._model, self._data, configuration)
-            placement = pin.updateFramePlacement(self._model, self._data, self._frame)
-            *position, x, y, z, w = pin.SE3ToXYZQUAT(placement).tolist()
-            poses.append((*position, w, x, y, z) if w > 0.0 else (*position, -w, -x, -y, -z))
-            half_turns = half_turns or abs(w) <= rotations.ZERO
-        found = np.array(poses)
-        position, quaternion = found[:, :3], found[:, 3:]
-        return position, rotations.canonical(quaternion) if half_turns else quaternion
+            placements.append(self._placement())
+        return _poses(placements)
+
+    def motion(self, q: Floats, qd: Floats) -> tuple[Floats, Floats, Floats]:
+        """What `pose` and `velocity` return; for few configurations in less time."""
+        if len(q) >= BATCH_FROM:
+            return *self.pose(q), self.velocity(q, qd)
+        placements, velocities = [], []
+        for row, speed in zip(q, qd, strict=True):
+            velocities.append(self._velocity_of_one(row, speed))
+            placements.append(self._placement())
+        return *_poses(placements), np.array(velocities)
+
+    def _placement(self) -> list[float]:
+        """Position and quaternion [x, y, z, w] of the end-effector frame, after Pinocchio's forward kinematics."""
+        placement = pin.updateFramePlacement(self._model, self._data, self._frame)
+        return pin.SE3ToXYZQUAT(placement).tolist()
 
     def velocity(self, q: Floats, qd: Floats) -> Floats:
         """The linear velocity J(q) q̇ (N, 3), m/s, of the end-effector frame's origin, for q and q̇ (N, J)."""
@@ -117,7 +127,6 @@ class Kinematics:
 
     def _velocity_of_one(self, q: Floats, qd: Floats) -> Floats:
         pin.forwardKinematics(self._model, self._data, q, qd)
-        pin.updateFramePlacement(self._model, self._data, self._frame)
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         velocity: Floats = pin.getFrameVelocity(self._model, self._data, self._frame, frame).linear
         return velocity
@@ -141,6 +150,17 @@ class Kinematics:
             coefficients[self.prismatic, :, 2] = 0.0
         np.matmul(coefficients, self._terms, out=flat)
         return flat.reshape(joints, count, 4, 4)
+
+
+def _poses(placements: list[list[float]]) -> tuple[Floats, Floats]:
+    """Positions (N, 3) and quaternions (N, 4), w >= 0, of N placements, each a position and [x, y, z, w]."""
+    poses, half_turns = [], False
+    for *position, x, y, z, w in placements:
+        poses.append((*position, w, x, y, z) if w > 0.0 else (*position, -w, -x, -y, -z))
+        half_turns = half_turns or abs(w) <= rotations.ZERO
+    found = np.array(poses)
+    quaternion = found[:, 3:]
+    return found[:, :3], rotations.canonical(quaternion) if half_turns else quaternion
 
 
 def motion_axis(joint: pin.JointModel) -> Floats:
