@@ -104,6 +104,6 @@ def from_matrix(rotation: Floats) -> Floats:
     xp, linear, constant = _OUTER_PRODUCT.like(rotation)
     rows = xp.arange(len(rotation), device=rotation.device)
     outer = rotation.reshape(-1, 9) @ linear + constant
-    largest = xp.argmax(outer[:, ::5], axis=-1)  # on the diagonal of 4 q qᵀ
+    largest = outer[:, ::5].argmax(-1)  # on the diagonal of 4 q qᵀ
     row = outer.reshape(-1, 4, 4)[rows, largest]
     return canonical(row / (2.0 * xp.sqrt(row[rows, largest]))[:, None])

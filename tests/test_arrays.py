@@ -18,8 +18,10 @@ from hypothesis.extra.numpy import arrays
 
 from gym_mara import rotations
 from gym_mara.arrays import Constants, contiguous, host, namespace, zeros_like
+from gym_mara.envs.statistics import EpisodeStatistics
+from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
-from gym_mara.tasks import TASKS, Goal, ReachTask, rewards
+from gym_mara.tasks import TASKS, Goal, Observation, ReachTask, rewards
 from gym_mara.types import Array, Floats, Mask
 
 FLOAT32 = {"number": 1e-5, "angle": 2e-3}
@@ -205,3 +207,31 @@ def test_the_rewards_and_terms_of_every_task_are_the_same(
         for key, value in result.items():
             assert value.dtype == (torch.bool if key == "terminated" else dtype), key
             np.testing.assert_allclose(host(value), expected[key], rtol=0.0, atol=atol, err_msg=key)
+
+
+@pytest.mark.parametrize("name", list(TASKS))
+def test_no_task_reads_a_value_or_leaves_the_device(mara: RobotModel, name: str) -> None:
+    """Tensors of the device "meta" have no values: a question to them, or a tensor of another device, is an error."""
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Any:
+        return torch.empty(shape, dtype=dtype, device="meta")
+
+    task, flags = TASKS[name], empty(8, dtype=torch.bool)
+    q, position, quaternion = empty(8, 6), empty(8, 3), empty(8, 4)
+    state = SimState(q, q, position, quaternion, position, flags, empty(8))
+    goal = Goal(position, quaternion)
+    home = Goal(np.zeros((8, 3)), np.zeros((8, 4)))
+    parts = task.observation(mara, home, mara.velocity_limit)
+    reward, terms = task.reward(state, goal)
+    statistics = EpisodeStatistics(8, q)
+    statistics.add(terms["distance"], reward, state.collided)
+    statistics.clear(flags)
+    results: dict[str, Any] = {
+        "observation": Observation(parts)(state, goal),
+        "reward": reward,
+        "terminated": task.terminated(state, goal),
+        **terms,
+        **statistics.summary(),
+    }
+    assert {value.device.type for value in results.values()} == {"meta"}
+    assert {value.dtype for value in results.values()} == {torch.float32, torch.bool, torch.int64}

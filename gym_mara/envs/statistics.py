@@ -33,7 +33,7 @@ class EpisodeStatistics:
     )
 
     def __init__(self, num_envs: int, like: Array | None = None) -> None:
-        xp = namespace(like)
+        self._xp = xp = namespace(like)
         device = None if like is None else like.device
         self._dtype = xp.float64 if like is None else like.dtype
         # In float64 always: sums over an episode lose digits, and float32 counts no further than 16 million steps. One row
@@ -52,7 +52,7 @@ class EpisodeStatistics:
 
     def add(self, distance: Floats, reward: Floats, collided: Mask) -> None:
         """Add one step of every episode. All arrays are (N,); the distance is in m."""
-        xp = namespace(self._step)
+        xp = self._xp
         self._step[0], self._step[1], self._step[3] = distance, reward, collided
         xp.maximum(self._max, self._extremes, out=self._max)
         xp.minimum(self._min, self._extremes, out=self._min)
@@ -66,14 +66,12 @@ class EpisodeStatistics:
 
     def summary(self) -> dict[str, NDArray[Any]]:
         """The statistics of every episode so far, each (N,)."""
-        xp = namespace(self._values)
+        xp = self._xp
         values = xp.asarray(self._values, copy=True)
-        values[4:6] /= values[6].clip(1.0)
-        counts = ("ep_steps", "num_coll")
-        return {
-            name: xp.asarray(row, dtype=xp.int64 if name in counts else self._dtype)
-            for name, row in zip(self.NAMES, values, strict=True)
-        }
+        values[4:6] /= xp.maximum(values[6], self._step[2])  # by at least 1 step
+        counts = xp.asarray(values[6:], dtype=xp.int64)
+        rows = (*xp.asarray(values[:6], dtype=self._dtype), *counts)
+        return dict(zip(self.NAMES, rows, strict=True))
 
     def of(self, index: int) -> dict[str, float]:
         """The statistics of one episode so far, as plain numbers."""

@@ -22,7 +22,7 @@ from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
 from gym_mara.tasks import MAX_EPISODE_STEPS, Task
-from gym_mara.types import Array, Floats, Mask
+from gym_mara.types import Floats, Mask
 
 
 class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
@@ -237,8 +237,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def _final(self, observation: Floats, ended: Mask) -> Any:
         """The observations of the ended arms: N objects of Gymnasium's format, or one tensor (N, O), zero for other arms."""
         if is_tensor(observation):
-            final = namespace(ended).where(ended[:, None], observation, _absent(observation))
-            return self.simulation.present(final)
+            final = _vector_info({"": observation}, ended)
+            return self.simulation.present(final[""])
         last = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended):
             last[index] = self.simulation.present(observation[index].copy())
@@ -312,7 +312,11 @@ def _vector_info(values: dict[str, Any], mask: Mask) -> dict[str, Any]:
         elif everyone:
             info[key] = value
         else:
-            info[key] = xp.where(_rows(mask, value), value, _absent(value))
+            plain = value.dtype != object
+            absent = (
+                xp.zeros((), dtype=value.dtype, device=value.device) if plain else np.array(None)
+            )
+            info[key] = xp.where(_rows(mask, value), value, absent)
         info[f"_{key}"] = mask
     return info
 
@@ -322,13 +326,6 @@ def _add_rows(info: dict[str, Any], values: dict[str, NDArray[Any]], arms: Mask)
     for key, value in values.items():
         info[key] = namespace(arms).where(_rows(arms, value), value, info[key])
         info[f"_{key}"] = info[f"_{key}"] | arms
-
-
-def _absent(value: Array) -> Array:
-    """The value of an arm that has none: None or zero."""
-    if is_tensor(value):
-        return value.new_zeros(())
-    return np.array(None) if value.dtype == object else np.zeros((), value.dtype)
 
 
 def _rows(mask: Mask, value: NDArray[Any]) -> Mask:

@@ -41,7 +41,7 @@ def _blocks(language: str) -> list[str]:
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """The folder of the package of docs/add_a_task.md, installed."""
-    task, init, _ = _blocks("python")
+    task, init, *_ = _blocks("python")
     (tmp_path / "my_package").mkdir()
     (tmp_path / "my_package" / "touch.py").write_text(task)
     (tmp_path / "my_package" / "__init__.py").write_text(init)
@@ -67,7 +67,8 @@ def _python(package: Path, *arguments: str) -> str:
 
 
 def test_the_example_of_the_page_works(package: Path) -> None:
-    _python(package, "-c", _blocks("python")[2])
+    _, _, *examples = _blocks("python")
+    _python(package, "-c", "\n".join(examples))
 
 
 def test_the_command_line_knows_the_task(package: Path) -> None:
