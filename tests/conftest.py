@@ -100,20 +100,21 @@ def gym_mara(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 @pytest.fixture
 def fake_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Register FakeBackend by an entry point, as another package would, and return its name; TensorBackend beside it."""
-    package = tmp_path / "gym_mara_fake-0.1.dist-info"
-    package.mkdir()
-    write(package / "METADATA", "Metadata-Version: 2.1\nName: gym_mara_fake\nVersion: 0.1\n")
-    write(
-        package / "entry_points.txt",
-        "[gym_mara.backends]\nfake = tests.backends.fake:FakeBackend\n"
-        "tensors = tests.backends.tensors:TensorBackend\n",
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    return "fake"
+    """Register FakeBackend and return its name."""
+    return _register("fake", "tests.backends.fake:FakeBackend", tmp_path, monkeypatch)
 
 
 @pytest.fixture
-def tensor_backend(fake_backend: str) -> str:
+def tensor_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Register TensorBackend and return its name."""
-    return "tensors"
+    return _register("tensors", "tests.backends.tensors:TensorBackend", tmp_path, monkeypatch)
+
+
+def _register(name: str, value: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Register a backend by an entry point, as another package would; returns its name."""
+    package = folder / f"gym_mara_{name}-0.1.dist-info"
+    package.mkdir()
+    write(package / "METADATA", f"Metadata-Version: 2.1\nName: gym_mara_{name}\nVersion: 0.1\n")
+    write(package / "entry_points.txt", f"[gym_mara.backends]\n{name} = {value}\n")
+    monkeypatch.syspath_prepend(folder)
+    return name
