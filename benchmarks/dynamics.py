@@ -27,6 +27,8 @@ from gym_mara.backends.mujoco.backend import MujocoBackend
 from gym_mara.robot import RobotModel
 
 ENV_ID = "gym_mara/MARACollisionOrient-v0"
+PEER_ID = "gym_mara/MARA-v0"
+"""The environment whose task is that of the other packages: bring the end effector to a position."""
 ARMS = 64
 BARE = "mujoco.rollout alone, one thread"
 RATIOS = (
@@ -134,8 +136,8 @@ def print_batches() -> None:
 
 def print_peers() -> None:
     """Compare one dynamic environment with the other packages that are installed."""
-    ours = {f"{ENV_ID}, backend='{name}'": name for name in ("mujoco", "dart")}
-    functions = {name: single(ENV_ID, backend=backend) for name, backend in ours.items()}
+    ours = {f"{PEER_ID}, backend='{name}'": name for name in ("mujoco", "dart")}
+    functions = {name: single(PEER_ID, backend=backend) for name, backend in ours.items()}
     for module, env_id in PEERS.items():
         try:
             with warnings.catch_warnings():
