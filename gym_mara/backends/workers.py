@@ -42,7 +42,7 @@ def choose_workers(num_envs: int, workers: int | None) -> int:
             "workers",
             workers,
             at_most=max(16, 4 * len(cores())),
-            reason="each is a process, and more than 4 for each core only take memory",
+            reason="each is a process, and more of them only take memory",
         )
         if num_envs % workers:
             fitting = [str(n) for n in range(1, num_envs + 1) if num_envs % n == 0]

@@ -36,7 +36,7 @@ def choose_threads(num_envs: int, threads: int | None) -> int:
             threads,
             or_else="None for one on each core",
             at_most=max(16, 4 * len(cores())),
-            reason="more than 4 for each core only wait for each other",
+            reason="more of them only wait for each other",
         )
     return min(threads, num_envs)
 
