@@ -199,20 +199,17 @@ def _add_motor(spec: Any, robot: RobotModel, number: int, shafts: bool) -> None:
 
 
 def _add_links(spec: Any, robot: RobotModel, bodies: list[Any]) -> None:
-    """Add the shapes of each link to a body of its own; exclude the pairs of links that may not collide.
-
-    A joint's body becomes that of the first link, and gets its name; the base's and further links of a joint need more bodies.
+    """Add the shapes of each link, on a body with the name of the link; exclude the pairs of links that may not collide.
 
     With pairs of bodies MuJoCo compares boxes around the shapes; with a list of pairs of shapes it compares only spheres,
     which took twice as long for MARA's table.
     """
     links: dict[str, Any] = {}
-    free, shapes = dict(enumerate(bodies[1:], 1)), robot.geometry.geometryObjects
+    shapes = robot.geometry.geometryObjects
     for index, (geometry, shape) in enumerate(zip(shapes, robot.shapes, strict=True)):
         link = robot.link_of(index)
         if link not in links:
-            joint = geometry.parentJoint
-            links[link] = free.pop(joint, None) or _add_body(bodies[joint], _LINK_INERTIA)
+            links[link] = _add_body(bodies[geometry.parentJoint], _LINK_INERTIA)
             links[link].name = f"link {link}"
         _add_shape(spec, links[link], geometry, shape)
     names = list(links)
