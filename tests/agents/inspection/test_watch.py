@@ -247,9 +247,9 @@ def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Pat
             "plot => plot.data.map(trace => [trace.name, trace.x.length ?? trace.x.bdata.length])"
         )
         torques = page.locator(".js-plotly-plot").nth(3).evaluate(traces)
-        assert {name for name, _ in torques} == {"dart"}
+        assert {name for name, _ in torques} == {"dart", "mujoco"}
         path = page.locator(".js-plotly-plot").nth(4).evaluate(traces)
-        assert [name for name, _ in path] == ["pinocchio", "dart", "target"]
+        assert [name for name, _ in path] == ["pinocchio", "dart", "mujoco", "target"]
         assert '"seed": 5' in page.locator("pre").inner_text()
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert errors == []
@@ -283,11 +283,14 @@ def test_a_full_disk_ends_a_report_with_a_clear_error(
 def test_a_report_names_a_backend_that_is_not_installed(
     finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in [name for name in sys.modules if name.startswith("gym_mara.backends.dart")]:
+    engines = {"dart": "dartpy", "mujoco": "mujoco"}
+    packages = tuple(f"gym_mara.backends.{name}" for name in engines)
+    for module in [name for name in sys.modules if name.startswith(packages)]:
         monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.setitem(sys.modules, "dartpy", None)
+    for library in engines.values():
+        monkeypatch.setitem(sys.modules, library, None)
     text = write_report(finished_run, tmp_path / "report.html").read_text()
-    assert "gym_mara[dart]" in text
+    assert all(f"gym_mara[{name}]" in text for name in engines)
     assert "No installed backend simulates torques" in text
 
 
