@@ -57,9 +57,8 @@ class MujocoBackend(ServoBackend):
         GymMaraError: a setting is out of its range, or MuJoCo cannot load the robot.
     """
 
-    most_arms = (
-        2**16
-    )  # with random parameters each has a model, of 35 kB for MARA and more with meshes
+    # With random parameters each has a model, of 35 kB for MARA and more with meshes.
+    most_arms = 2**16
 
     def __init__(
         self,
@@ -107,10 +106,8 @@ class MujocoBackend(ServoBackend):
         self._effort_limit = np.tile(robot.effort_limit, (num_envs, 1))
         steps = len(self._times) - 1
         self._controls = np.empty((num_envs, steps, joints))
-        self._no_controls, self._no_warmstarts = (
-            np.zeros((num_envs, 1, joints)),
-            np.zeros((num_envs, nv)),
-        )
+        self._no_controls = np.zeros((num_envs, 1, joints))
+        self._no_warmstarts = np.zeros((num_envs, nv))
         self._whole_time = (steps - 0.5) * self.physics_step
         self.reset(np.tile(robot.home, (num_envs, 1)))
 

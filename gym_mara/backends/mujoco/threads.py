@@ -93,7 +93,7 @@ class Stepper:
                 initial_warmstart=warmstarts,
                 state=after,
                 sensordata=measured,
-                # With few arms, MuJoCo's own smaller chunks took a fifth longer: threads wait for each chunk.
+                # With few arms, MuJoCo's own smaller chunks took a quarter longer: threads wait for each chunk.
                 chunk_size=-(-arms // (len(self._data) * min(steps, 2))),
             )
         finally:
