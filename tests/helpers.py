@@ -32,10 +32,12 @@ PATH_ENDS = ((0.5, -1.9, -0.3, -2.4, 1.1, -2.6), (0.5, -1.9, -0.3, 2.4, 1.1, -2.
 """Two collision-free configurations of MARA. On the way, with motor4 between about -1.15 and 1.06 rad, the tool
 collides with the arm."""
 
-WITHOUT_GPU: dict[str, dict[str, Any]] = {"warp": {"device": "cpu"}}
-"""The settings that a backend needs on a machine without a GPU, by its name. It is slow there."""
+WARP_DEVICE = os.environ.get("WARP_DEVICE", "cpu")
+"""Where Warp runs in tests. It is slow on a CPU; on a machine with a GPU, set the variable to "cuda:0"."""
+DEVICES: dict[str, dict[str, Any]] = {"warp": {"device": WARP_DEVICE}}
+"""The settings that a backend needs on this machine, by its name."""
 EVERY_BACKEND = [
-    pytest.param(name, marks=pytest.mark.slow if name in WITHOUT_GPU else ())
+    pytest.param(name, marks=pytest.mark.slow if name in DEVICES else ())
     for name in backend_names()
 ]
 

@@ -8,7 +8,7 @@ import pytest
 from gym_mara.envs import MaraEnv
 from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import TASKS
-from tests.helpers import EVERY_BACKEND, MODULAR_ARMS, WITHOUT_GPU
+from tests.helpers import DEVICES, EVERY_BACKEND, MODULAR_ARMS
 
 ARMS: dict[str, RobotLike] = {
     **{name: name for name in ("ur5", "ur10", "panda", "so100", "talos_arm")},
@@ -32,7 +32,7 @@ def test_an_arm_runs_every_task_and_can_be_drawn(arm: str, backend: str) -> None
             renderer="raycast",
             width=160,
             height=120,
-            **WITHOUT_GPU.get(backend, {}),
+            **DEVICES.get(backend, {}),
         )
         env.reset(seed=0)
         for _ in range(5):

@@ -9,7 +9,7 @@ import pytest
 from gym_mara.backends import backend_names, make_backend
 from gym_mara.robot import RobotModel
 from gym_mara.testing import BackendContract, Make
-from tests.helpers import MODULAR_ARMS, robot_model, write
+from tests.helpers import DEVICES, MODULAR_ARMS, robot_model, write
 
 # A cart on a rail with an arm of two joints, which reach a post at the end of the rail, and the rail itself.
 RAIL = """
@@ -57,7 +57,7 @@ RANDOM = {
 }
 TRAVELLING = {"max_joint_velocity": 1.0}
 # Two physics steps, because each takes long on a CPU; and room for arms that random poses put deep into the table.
-WARP = {"device": "cpu", "control_period": 0.008, "physics_step": 0.004, "max_contacts": 96}
+WARP = DEVICES["warp"] | {"control_period": 0.008, "physics_step": 0.004, "max_contacts": 96}
 OTHER_ROBOTS = ("3 joints", "7 joints", "rail")
 CASES = {
     **{name: Case(name) for name in backend_names()},

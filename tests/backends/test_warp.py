@@ -1,4 +1,4 @@
-"""The backend on MuJoCo Warp, on its CPU device: against Pinocchio, Coal and MuJoCo; tensors, errors, messages.
+"""The backend on MuJoCo Warp: against Pinocchio, Coal and MuJoCo; tensors, errors, messages.
 
 All numbers of the engine are in single precision. The tolerances follow from it.
 """
@@ -29,7 +29,7 @@ from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.testing import COLLIDING_Q, arrays_of, assert_same_state, pickled, uniform_q
-from tests.helpers import upright_arm, write
+from tests.helpers import WARP_DEVICE, upright_arm, write
 
 # The path from home is free of collisions.
 FREE_TARGET = np.array([0.3, 0.5, -0.6, 0.4, 0.7, -0.9])
@@ -42,7 +42,7 @@ MODES: list[dict[str, Any]] = [
 
 
 def _warp(robot: RobotModel, num_envs: int, **settings: Any) -> WarpBackend:
-    return WarpBackend(robot, num_envs, device="cpu", **settings)
+    return WarpBackend(robot, num_envs, device=WARP_DEVICE, **settings)
 
 
 def test_it_falls_as_pinocchio_says(mara: RobotModel) -> None:
@@ -183,16 +183,16 @@ def _numbers(state: SimState) -> SimState:
     values = {name: getattr(state, name) for name in vars(state)}
     for name, value in values.items():
         if isinstance(value, torch.Tensor):
-            assert value.device.type == "cpu"
+            assert value.device.type == WARP_DEVICE.split(":")[0]
             assert value.dtype in (torch.float32, torch.bool)
-            values[name] = value.numpy()
+            values[name] = value.cpu().numpy()
     return SimState(**values)
 
 
 @pytest.mark.parametrize("settings", MODES, ids=str)
 def test_tensors_have_the_values_of_arrays(mara: RobotModel, settings: dict[str, Any]) -> None:
     numbers, tensors = (_warp(mara, 3, arrays=a, **settings) for a in ("numpy", "torch"))
-    assert (numbers.device, tensors.device) == (None, "cpu")
+    assert (numbers.device, tensors.device) == (None, WARP_DEVICE)
     start = np.array([COLLIDING_Q, mara.home, mara.home])
     mask = np.array([True, False, True])
     for backend in (numbers, tensors):
@@ -258,7 +258,9 @@ def test_arrays_of_another_library_are_refused(mara: RobotModel, arrays: str, fo
 
 def test_tensors_of_another_device_are_refused(mara: RobotModel) -> None:
     backend = _warp(mara, 1, arrays="torch", dynamics=False)
-    with pytest.raises(GymMaraError, match=r"q_target is a torch.Tensor on meta.* on cpu"):
+    with pytest.raises(
+        GymMaraError, match=rf"q_target is a torch.Tensor on meta.* on {WARP_DEVICE}"
+    ):
         backend.step(torch.zeros(1, 6, device="meta"))  # type: ignore[arg-type]
 
 
@@ -353,7 +355,7 @@ def test_without_a_gpu_the_error_names_the_cpu(
 )
 def test_bad_settings_are_refused(mara: RobotModel, settings: dict[str, Any]) -> None:
     with pytest.raises(GymMaraError, match=next(iter(settings))):
-        WarpBackend(mara, 1, **{"device": "cpu"} | settings)
+        WarpBackend(mara, 1, **{"device": WARP_DEVICE} | settings)
 
 
 def test_too_little_memory_is_an_error_that_names_how_many_arms_fit() -> None:

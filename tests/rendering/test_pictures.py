@@ -24,7 +24,7 @@ from gym_mara.rendering import CAMERAS, RENDERERS, RenderSettings
 from gym_mara.rendering.camera import VIEW_ANGLE, place_camera
 from gym_mara.rendering.scene import Scene
 from gym_mara.testing import COLLIDING_Q
-from tests.helpers import EVERY_BACKEND, TARGET_Q, WITHOUT_GPU
+from tests.helpers import DEVICES, EVERY_BACKEND, TARGET_Q
 
 Picture = NDArray[np.uint8]
 
@@ -89,7 +89,7 @@ def test_a_picture_is_a_fresh_array_of_the_requested_size(renderer: str) -> None
 
 @pytest.mark.parametrize("backend", EVERY_BACKEND)
 def test_colliding_links_are_red_until_the_next_step(renderer: str, backend: str) -> None:
-    options = SMALL | WITHOUT_GPU.get(backend, {})
+    options = SMALL | DEVICES.get(backend, {})
     env = MaraEnv(render_mode="rgb_array", backend=backend, renderer=renderer, **options)
     env.reset(seed=0)
     counts, hits = [], []
