@@ -7,8 +7,8 @@ from typing import NamedTuple
 from gymnasium.envs.registration import register
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
-from gym_mara.tasks.base import Task
-from gym_mara.tasks.registry import MAX_EPISODE_STEPS, TASKS, named_task, task_names
+from gym_mara.tasks.base import MAX_EPISODE_STEPS, Task
+from gym_mara.tasks.registry import TASKS, named_task, task_names
 
 _NAMESPACE = "gym_mara"
 
@@ -18,7 +18,7 @@ class Environment(NamedTuple):
 
     task: str
     """The name of its task."""
-    max_episode_steps: int = MAX_EPISODE_STEPS
+    max_episode_steps: int
     """The length of its episodes, steps."""
     goals: bool = False
     """Whether it is a goal environment: its classes are MaraGoalEnv and MaraGoalVectorEnv, else MaraEnv and MaraVectorEnv."""
@@ -29,14 +29,15 @@ ENVIRONMENTS: dict[str, Environment] = {}
 
 
 def register_task(
-    name: str, task: Task | None = None, *, max_episode_steps: int = MAX_EPISODE_STEPS
+    name: str, task: Task | None = None, *, max_episode_steps: int | None = None
 ) -> None:
     """Register a task as an environment of Gymnasium, single and vectorised.
 
     Args:
         name: the name of the task and the id of the environment, such as "my_package/MARATouch-v0".
         task: the task; None for the task of an entry point `gym_mara.tasks` with this name.
-        max_episode_steps: the number of steps after which an episode is truncated.
+        max_episode_steps: the number of steps after which an episode is truncated; by default that of the task, or of the
+            paper's environments for the task of an entry point.
 
     Raises:
         GymMaraError: `task` is no Task, or another task has this name.
@@ -45,7 +46,9 @@ def register_task(
         raise GymMaraError(f"task must be a Task, such as TouchTask(), not {task!r}")
     if task is not None and TASKS.setdefault(name, task) != task:
         raise GymMaraError(f"another task has the name {name!r}: choose another name")
-    steps = whole_number("max_episode_steps", max_episode_steps)
+    steps = MAX_EPISODE_STEPS if task is None else task.episode_steps
+    if max_episode_steps is not None:
+        steps = whole_number("max_episode_steps", max_episode_steps)
     _register(name, Environment(name, steps), {"task": name})
 
 
@@ -63,8 +66,8 @@ def _register(name: str, environment: Environment, keywords: dict[str, str]) -> 
 
 def register_environments() -> None:
     """Register the environments of this package."""
-    for name in TASKS:
-        register_task(name)
+    for name, task in list(TASKS.items()):
+        register_task(name, task)
     _register("MARAGoal-v0", Environment("MARARandomTarget-v0", 50, goals=True), {})
 
 
@@ -91,8 +94,9 @@ def environment(name: str) -> Environment:
     """
     own = environment_name(name)
     if own not in ENVIRONMENTS:
-        named_task(own)  # imports the other package, which may register it
-    return ENVIRONMENTS.get(own) or Environment(own)
+        task = named_task(own)  # imports the other package, which may register it
+        return ENVIRONMENTS.get(own) or Environment(own, task.episode_steps)
+    return ENVIRONMENTS[own]
 
 
 def environment_name(name: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from gym_mara.collision.coal import CoalChecker
@@ -11,6 +13,8 @@ from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.types import Floats
 
 _TRIES = 10_000
+_STEP = 0.05
+"""The longest way of any point of the arm between two checks of a move, m."""
 
 
 class FreePoses:
@@ -32,11 +36,45 @@ class FreePoses:
         Raises:
             GymMaraError: none of many random configurations is free.
         """
+        return self._pose(self._free_configuration(generator))
+
+    def draw_move(
+        self, generator: np.random.Generator, start: Floats | None = None
+    ) -> tuple[Floats, Floats, Floats]:
+        """A start (J,), rad, drawn as in `draw` unless it is given, and a pose to which a free joint move leads.
+
+        Returns:
+            The start; and the pose, position (3,), m, and quaternion (4,), [w, x, y, z], of another configuration. No collision
+            is on the straight joint move from the one to the other, checked every _STEP.
+
+        Raises:
+            GymMaraError: no free configuration, or none with a free move, is found.
+        """
         for _ in range(_TRIES):
-            q = generator.uniform(self._low, self._high)[None]
-            if not self._checker.check(q)[0]:
-                position, quaternion = self._kinematics.pose(q)
-                return position[0], quaternion[0]
+            begin = self._free_configuration(generator) if start is None else start
+            end = self._free_configuration(generator)
+            if not self._checker.check(self._move(begin, end)).any():
+                return begin, *self._pose(end)
+        raise GymMaraError(
+            f"{self._robot.name} collides on all of {_TRIES} random joint moves"
+            + ("" if start is None else f" from {start.tolist()}: choose another start_q")
+        )
+
+    def _move(self, begin: Floats, end: Floats) -> Floats:
+        """The configurations between two (K, J) on the straight joint move, no point of the arm more than _STEP apart."""
+        way = end - begin
+        count = math.ceil(float((np.abs(way) * self._robot.reach).sum()) / _STEP)
+        return begin + np.linspace(0.0, 1.0, count + 1)[:-1, None] * way
+
+    def _pose(self, q: Floats) -> tuple[Floats, Floats]:
+        position, quaternion = self._kinematics.pose(q[None])
+        return position[0], quaternion[0]
+
+    def _free_configuration(self, generator: np.random.Generator) -> Floats:
+        for _ in range(_TRIES):
+            q = generator.uniform(self._low, self._high)
+            if not self._checker.check(q[None])[0]:
+                return q
         raise GymMaraError(
             f"{self._robot.name} collides at all of {_TRIES} random configurations; "
             "check which pairs of links its SRDF disables"

@@ -7,6 +7,7 @@ import numpy as np
 from gym_mara.collision.free_poses import FreePoses, reachable_pose
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
+from gym_mara.tasks.base import Draw
 from gym_mara.types import Floats
 
 
@@ -19,6 +20,7 @@ class RobotWorkspace:
 
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
+        self.home = robot.home
         self._free_poses: FreePoses | None = None
 
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
@@ -27,9 +29,21 @@ class RobotWorkspace:
         Raises:
             GymMaraError: almost all configurations of the robot collide.
         """
+        return self._poses.draw(generator)
+
+    def draw_move(self, generator: np.random.Generator, start: Floats | None = None) -> Draw:
+        """A random start and the pose of another configuration, with a free joint move between them.
+
+        Raises:
+            GymMaraError: almost all configurations of the robot, or all moves from the start, collide.
+        """
+        return Draw(*self._poses.draw_move(generator, start))
+
+    @property
+    def _poses(self) -> FreePoses:
         if self._free_poses is None:
             self._free_poses = FreePoses(self._robot)
-        return self._free_poses.draw(generator)
+        return self._free_poses
 
     def default_pose(self) -> tuple[Floats, Floats]:
         """The pose of a collision-free configuration, always the same for a robot."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from gym_mara.tasks.base import Task, Workspace
+from gym_mara.tasks.any_target import AnyTargetTask
+from gym_mara.tasks.base import MAX_EPISODE_STEPS, Draw, Task, Workspace
 from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Observation, Part
 from gym_mara.tasks.reach import ReachTask
 from gym_mara.tasks.registry import (
-    MAX_EPISODE_STEPS,
     PAPER_TASKS,
     TASKS,
     named_task,
@@ -18,6 +18,8 @@ __all__ = [
     "MAX_EPISODE_STEPS",
     "PAPER_TASKS",
     "TASKS",
+    "AnyTargetTask",
+    "Draw",
     "Goal",
     "Observation",
     "Part",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,13 +20,35 @@ if TYPE_CHECKING:
     from gym_mara.robot import RobotModel
 
 ON_COLLISION = ("reset", "terminate", "continue")
+MAX_EPISODE_STEPS = 2048
+"""The length of the paper's episodes, steps."""
+
+
+class Draw(NamedTuple):
+    """What is drawn for one episode."""
+
+    start: Floats | None
+    """The start configuration (J,), rad; None for the task's usual one."""
+    position: Floats
+    """Of the goal (3,), m."""
+    quaternion: Floats
+    """Of the goal (4,), [w, x, y, z]."""
 
 
 class Workspace(Protocol):
     """The poses that the end effector can reach. A pose is a position (3,), m, and a quaternion (4,), [w, x, y, z]."""
 
+    home: Floats
+    """The robot's home configuration (J,), rad."""
+
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
         """The pose of a random collision-free configuration."""
+
+    def draw_move(self, generator: np.random.Generator, start: Floats | None = None) -> Draw:
+        """A random collision-free start, unless one is given, and the pose of another configuration.
+
+        No collision is on the straight joint move from the one to the other.
+        """
 
     def default_pose(self) -> tuple[Floats, Floats]:
         """The pose of a collision-free configuration, always the same for a robot."""
@@ -48,6 +70,14 @@ class Task(ABC):
 
     random_goal: ClassVar[bool] = False
     """Whether `draw_goal` draws a new goal for each episode."""
+
+    default_action: ClassVar[str] = "absolute"
+    """The action mode of the environments unless the keyword argument `action` chooses one."""
+
+    observes_action: ClassVar[bool] = False
+    """Whether the last action is a part of the observation, the last one."""
+    episode_steps: ClassVar[int] = MAX_EPISODE_STEPS
+    """The length of episodes, unless a registered environment has its own, steps."""
 
     on_collision: str = "reset"
     """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or
@@ -82,6 +112,13 @@ class Task(ABC):
             generator: the random generator of the arm's goals.
         """
         raise NotImplementedError
+
+    def draw(self, workspace: Workspace, generator: np.random.Generator) -> Draw:
+        """Draw the start and the goal of one episode; by default the goal of `draw_goal`, and no start.
+
+        Environments call this method only if `random_goal` is true.
+        """
+        return Draw(None, *self.draw_goal(workspace, generator))
 
     @abstractmethod
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:

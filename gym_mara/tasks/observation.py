@@ -90,6 +90,23 @@ def joint_positions(robot: RobotModel) -> Part:
     return Part("joint_positions", robot.lower, robot.upper, _joint_positions, joint_limits=True)
 
 
+def joint_velocities(joint_velocity: Floats) -> Part:
+    """The joint velocities (J,), rad/s (m/s for a prismatic joint).
+
+    Args:
+        joint_velocity: the largest speed of each joint (J,), rad/s.
+    """
+    bound = np.maximum(joint_velocity, _NARROWEST)
+    return Part("joint_velocities", -bound, bound, _joint_velocities)
+
+
+def last_action(space: Box) -> Part:
+    """The last action (A,), in the units of the action space; zero at the start of an episode."""
+    return Part(
+        "last_action", space.low.astype(np.float64), space.high.astype(np.float64), _last_action
+    )
+
+
 def position_error(robot: RobotModel, farthest: float) -> Part:
     """The position of the end effector minus the position of the target (3,), m.
 
@@ -145,6 +162,15 @@ def _quaternion(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:
 
 def _joint_positions(state: SimState, goal: Goal) -> Floats:
     return state.q
+
+
+def _joint_velocities(state: SimState, goal: Goal) -> Floats:
+    return state.qd
+
+
+def _last_action(state: SimState, goal: Goal) -> Floats:
+    assert state.action is not None
+    return state.action
 
 
 def _position_error(state: SimState, goal: Goal) -> Floats:

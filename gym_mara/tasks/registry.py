@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gym_mara.errors import GymMaraError, unknown
+from gym_mara.tasks.any_target import AnyTargetTask
 from gym_mara.tasks.base import Task
 from gym_mara.tasks.random_reach import RandomReachTask
 from gym_mara.tasks.reach import ReachTask
@@ -18,12 +19,12 @@ TASKS: dict[str, Task] = {
     "MARACollision-v0": ReachTask(collision_penalty=True),
     "MARACollisionOrient-v0": ReachTask(orientation=True, collision_penalty=True),
     "MARARandomTarget-v0": RandomReachTask(),
+    "MARAReach-v0": AnyTargetTask(),
+    "MARAPose-v0": AnyTargetTask(orientation=True, position_tolerance=0.005),
 }
 """The tasks of this package, and those that `gym_mara.register_task` has added."""
 PAPER_TASKS = tuple(TASKS)[:4]
 """The four environments of ROS2Learn."""
-MAX_EPISODE_STEPS = 2048
-"""The episode length of the registered environments, steps."""
 _GROUP = "gym_mara.tasks"
 
 

@@ -1,6 +1,7 @@
-"""The reward terms of ROS2Learn's MARA environments, as pure functions of arrays of NumPy or torch.
+"""The terms of rewards, as pure functions of arrays of NumPy or torch.
 
-Source: gym-gazebo2 (arXiv 1903.06278). Its constants are the default values of `gym_mara.tasks.reach.ReachTask`.
+Those of ROS2Learn's MARA environments come from gym-gazebo2 (arXiv 1903.06278). Its constants are the default values of
+`gym_mara.tasks.reach.ReachTask`.
 """
 
 from __future__ import annotations
@@ -61,3 +62,15 @@ def collision_penalty(collided: Mask, distance: Floats, delta: float, eta: float
 @lru_cache(maxsize=64)
 def _penalty_constants(delta: float, eta: float) -> Constants:
     return Constants(1.0, 2.0, delta, eta)
+
+
+_CLOSENESS = Constants([0.3, 0.25, 0.25, 0.2], [-1 / 0.3, -1 / 0.03, -1 / 0.003, -1 / 0.0005], 0.2)
+
+
+def closeness(error: Floats) -> Floats:
+    """The reward for any target: 1 with no error, with a slope at every scale, for an error E (...,), m.
+
+    0.3 e^(-E/0.3) + 0.25 e^(-E/0.03) + 0.25 e^(-E/0.003) + 0.2 e^(-E/0.0005) - 0.2 E.
+    """
+    xp, heights, exponents, slope = _CLOSENESS.like(error)
+    return xp.sum(heights * xp.exp(error[..., None] * exponents), axis=-1) - slope * error

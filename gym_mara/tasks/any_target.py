@@ -1,0 +1,134 @@
+"""Reach any target: a random position or pose in each episode, from a random start, without a collision on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from gym_mara import rotations
+from gym_mara.arrays import Constants, zeros_like
+from gym_mara.errors import flag, one_of, positive_number
+from gym_mara.state import SimState
+from gym_mara.tasks import observation, rewards
+from gym_mara.tasks.arm_parts import ArmParts
+from gym_mara.tasks.base import Draw, Task, Workspace
+from gym_mara.tasks.goal import Goal
+from gym_mara.tasks.observation import Part
+from gym_mara.types import Floats
+
+if TYPE_CHECKING:
+    from gym_mara.robot import RobotModel
+
+STARTS = ("random", "home")
+_ONE = Constants(1.0)
+# The smallest and the largest positive value of each number, its unit, and whether it can be zero.
+_RANGES = {
+    "position_tolerance": (1e-6, 1.0, "m", False),
+    "angle_tolerance": (1e-6, np.pi, "rad", False),
+    "length_per_angle": (1e-3, 10.0, "m/rad", False),
+    "rate_weight": (1e-6, 1e3, "", True),
+    "collision_weight": (1e-6, 1e6, "", True),
+}
+
+
+@dataclass(frozen=True)
+class AnyTargetTask(Task):
+    """Bring the end effector to a random target, drawn for each episode, and keep it there.
+
+    The start and the target are collision-free configurations, and the straight joint move between them is free as well, so
+    every target can be reached. Each value is a keyword argument of the environments.
+    """
+
+    random_goal: ClassVar[bool] = True
+    default_action: ClassVar[str] = "relative"
+    observes_action: ClassVar[bool] = True
+    episode_steps: ClassVar[int] = 200
+
+    on_collision: str = "terminate"
+    orientation: bool = False
+    """Whether the target has an orientation."""
+    start: str = "random"
+    """Where episodes begin: at a "random" collision-free configuration, or at "home"; `start_q` has precedence."""
+    position_tolerance: float = 0.002
+    """The largest distance to the target that is a success, m."""
+    angle_tolerance: float = np.radians(2.5)
+    """The largest angle to the target that is a success, rad; used with `orientation`."""
+    length_per_angle: float = 0.2
+    """How much an angle counts beside a distance, m/rad."""
+    rate_weight: float = 0.05
+    """How much the change of actions costs."""
+    collision_weight: float = 100.0
+    """How much a collision costs."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "orientation", flag("orientation", self.orientation))
+        one_of("start", self.start, STARTS)
+        for name, (low, high, unit, or_zero) in _RANGES.items():
+            value = positive_number(
+                name,
+                getattr(self, name),
+                unit,
+                or_zero=or_zero,
+                at_least=low,
+                at_most=high,
+                reason="the reward is not accurate with others",
+            )
+            object.__setattr__(self, name, value)
+
+    def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
+        """The default pose of the workspace, until the first episode draws another."""
+        position, quaternion = workspace.default_pose()
+        return Goal(np.tile(position, (num_envs, 1)), np.tile(quaternion, (num_envs, 1)))
+
+    def draw(self, workspace: Workspace, generator: np.random.Generator) -> Draw:
+        fixed = self.start_q is not None or self.start == "home"
+        start = self.start_q if self.start_q is not None else workspace.home
+        return workspace.draw_move(generator, np.array(start) if fixed else None)
+
+    def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
+        """Joint positions and velocities, the poses of the tool and the target, and the parts of `ArmParts`."""
+        parts = [
+            observation.joint_positions(robot),
+            observation.joint_velocities(joint_velocity),
+            observation.tool_position(robot),
+            observation.target_position(robot),
+        ]
+        if self.orientation:
+            parts += [observation.tool_quaternion(), observation.target_quaternion()]
+        own = ArmParts(robot, joint_velocity, self.orientation, self.length_per_angle)
+        return [*parts, *own.parts()]
+
+    def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
+        """How near the tool is to the target, less the costs of the action's change and of a collision; and the terms.
+
+        The terms are `distance` and `position_error` (m), `angle_error` (rad), `reward_closeness`, `reward_rate`,
+        `reward_collision`, and `success`.
+        """
+        error = state.ee_position - goal.position
+        xp, _ = _ONE.like(error)
+        distance = xp.sqrt(xp.vecdot(error, error))
+        angle = rotations.angle_between(state.ee_quaternion, goal.quaternion)
+        success = distance <= self.position_tolerance
+        together = distance
+        if self.orientation:
+            together = distance + self.length_per_angle * angle
+            success = success & (angle <= self.angle_tolerance)
+        close = rewards.closeness(together)
+        rate = zeros_like(close)
+        if state.action is not None and state.last_action is not None:
+            change = state.action - state.last_action
+            rate = self.rate_weight * xp.mean(change * change, axis=-1)
+        collision = self.collision_weight * xp.astype(state.collided, close.dtype)
+        return close - rate - collision, {
+            "distance": distance,
+            "position_error": distance,
+            "angle_error": angle,
+            "reward_closeness": close,
+            "reward_rate": -rate,
+            "reward_collision": -collision,
+            "success": success & ~state.collided,
+        }

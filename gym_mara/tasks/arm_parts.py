@@ -1,0 +1,180 @@
+"""Parts of an observation that need the arm's geometry: which way each joint leads to the target, and which into a collision.
+
+They take forward kinematics alone, which a real arm knows as well; no inverse kinematics is solved.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gym_mara.arrays import Constants
+from gym_mara.robot.clearance import FAR, WIDTH, Clearance
+from gym_mara.robot.kinematics import JointFrames
+from gym_mara.state import SimState
+from gym_mara.tasks.goal import Goal
+from gym_mara.tasks.observation import Part
+from gym_mara.types import Floats
+
+if TYPE_CHECKING:
+    from gym_mara.robot import RobotModel
+
+DAMPING = 0.05
+"""Of the least squares, m: it keeps a joint's step small near a singularity."""
+STEP_TIME = 0.02
+"""A step of the least squares is relative to how far a joint travels in this time, s."""
+_SCALES, _ANGLE_SCALES = (0.1, 0.03), (0.3, 0.1)
+"""At each of these scales k, m or rad, an error e is observed as e / (|e| + k)."""
+_LEVER = 0.01
+"""With levers of this length, m, a joint's way to the target counts half; it is undefined with none."""
+_SMALL = 1e-9
+
+
+class ArmParts:
+    """Parts that are computed once for a state and its goal, whichever of them an observation has.
+
+    Args:
+        robot: the arm.
+        joint_velocity: the largest speed of each joint (J,), rad/s.
+        orientation: whether the target has an orientation.
+        length_per_angle: how much an angle of the tool counts, m/rad.
+    """
+
+    def __init__(
+        self, robot: RobotModel, joint_velocity: Floats, orientation: bool, length_per_angle: float
+    ) -> None:
+        self._made_of = robot, joint_velocity, orientation, length_per_angle
+        self._joints = robot.num_joints
+        self._kinematics, self._clearance = robot.kinematics(), Clearance(robot)
+        self._orientation = orientation
+        slides = self._kinematics.prismatic.astype(np.float64)
+        rows = np.array([1.0] * 3 + [length_per_angle] * 3)[: 6 if orientation else 3]
+        damping = DAMPING**2 * np.eye(len(rows))
+        step = STEP_TIME * joint_velocity
+        self._constants = Constants(slides, rows[:, None], damping, step, _SMALL, _LEVER)
+        self._scales = Constants(_SCALES, _ANGLE_SCALES)
+        self._seen: tuple[Any, ...] = (None, None)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._made_of
+
+    def parts(self) -> list[Part]:
+        """All parts, in order."""
+        joints, turns = self._joints, self._orientation
+        parts = [
+            _part("position_error_at_scales", 3 * len(_SCALES), self.position_error_at_scales),
+            _part("joint_ways", joints, self.joint_ways, math.pi),
+        ]
+        if turns:
+            parts += [
+                _part("angle_error_at_scales", 3 * len(_ANGLE_SCALES), self.angle_error_at_scales),
+                _part("joint_turns", joints, self.joint_turns, math.pi),
+            ]
+        return [
+            *parts,
+            _part("joint_steps", joints, self.joint_steps),
+            _part("clearance", 1, self.clearance),
+            _part("joint_repulsions", joints, self.joint_repulsions),
+        ]
+
+    def position_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
+        """The way from the tool to the target e (N, 3), m, as e / (|e| + k) for each scale k."""
+        _, way, _, _ = self._look(state, goal)
+        xp, scales, _ = self._scales.like(way)
+        return _at_scales(xp, way, scales)
+
+    def angle_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
+        """The rotation vector from the tool to the target θ (N, 3), rad, as θ / (|θ| + k) for each scale k."""
+        _, _, turn, _ = self._look(state, goal)
+        xp, _, scales = self._scales.like(turn)
+        return _at_scales(xp, turn, scales)
+
+    def joint_ways(self, state: SimState, goal: Goal) -> Floats:
+        """How far each joint alone must move to bring the tool nearest to the target (N, J), rad (m for a prismatic joint).
+
+        The step of cyclic coordinate descent (Wang and Chen 1991, doi 10.1109/70.86079). It fades where the axis goes through
+        the tool or the target.
+        """
+        frames, way, _, _ = self._look(state, goal)
+        xp, slides, _, _, _, _, lever = self._constants.like(way)
+        axes = frames.axes
+        tool = state.ee_position[:, None] - frames.origins
+        target = tool + way[:, None]
+        tool_along, target_along = (xp.sum(each * axes, axis=-1) for each in (tool, target))
+        sine = xp.sum(xp.linalg.cross(tool, target) * axes, axis=-1)
+        cosine = xp.sum(tool * target, axis=-1) - tool_along * target_along
+        levers = xp.sqrt(sine * sine + cosine * cosine)  # the product of both
+        angle = xp.atan2(sine, cosine) * (levers / (levers + lever**2))
+        return angle + slides * (target_along - tool_along - angle)
+
+    def joint_turns(self, state: SimState, goal: Goal) -> Floats:
+        """How far each joint alone must turn to align the tool best with the target's orientation (N, J), rad; 0 if prismatic.
+
+        The angle β about the axis a that makes |w| of the remaining rotation largest: tan(β/2) = -a·v / w for the rotation
+        [w, v] from the target to the tool.
+        """
+        frames, way, _, error = self._look(state, goal)
+        xp, slides, _, _, _, _, lever = self._constants.like(way)
+        along = xp.sum(frames.axes * error[:, None, 1:], axis=-1)
+        w = error[:, :1]
+        size = xp.sqrt(along * along + w * w)
+        angle = -2.0 * xp.atan2(along, w) * (size / (size + lever))
+        return angle - slides * angle
+
+    def joint_steps(self, state: SimState, goal: Goal) -> Floats:
+        """The step of all joints by damped least squares (N, J), relative to how far joints travel in STEP_TIME, at most 1.
+
+        δ = Jᵀ (J Jᵀ + λ² I)⁻¹ e (Wampler 1986, doi 10.1109/TSMC.1986.289285); a longer step is shortened as a whole.
+        """
+        frames, way, turn, _ = self._look(state, goal)
+        xp, _, rows, damping, step, _, _ = self._constants.like(way)
+        error = xp.concat([way, turn], axis=-1) if self._orientation else way
+        count = error.shape[-1]
+        jacobian = frames.jacobian[:, :count] * rows
+        error = (error * rows[:, 0])[..., None]
+        gram = jacobian @ xp.permute_dims(jacobian, (0, 2, 1)) + damping
+        solved = xp.linalg.solve(gram, error)
+        steps = (xp.permute_dims(jacobian, (0, 2, 1)) @ solved)[..., 0] / step
+        longest = xp.max(xp.abs(steps), axis=-1, keepdims=True)
+        return steps / xp.where(longest > 1.0, longest, xp.ones_like(longest))
+
+    def clearance(self, state: SimState, goal: Goal) -> Floats:
+        """The least distance of links that may collide, by `gym_mara.robot.clearance` (N, 1), m, relative to its largest value."""
+        least, _ = self._nearness(state, goal)
+        return least[:, None] / FAR
+
+    def joint_repulsions(self, state: SimState, goal: Goal) -> Floats:
+        """Which way each joint leads away from collisions (N, J), from -1 to 1."""
+        _, repulsion = self._nearness(state, goal)
+        xp = self._constants.like(repulsion)[0]
+        return repulsion / (xp.abs(repulsion) + WIDTH)
+
+    def _look(self, state: SimState, goal: Goal) -> tuple[JointFrames, Floats, Floats, Floats]:
+        """The frames of the joints; the way (N, 3), m, and the rotation vector (N, 3), rad, from the tool to the target; and
+        the rotation from the target to the tool (N, 4)."""
+        if self._seen[0] is not state or self._seen[1] is not goal:
+            frames = self._kinematics.joint_frames(state.q)
+            error = goal.orientation_error(state.ee_quaternion)
+            xp, *_, small, _ = self._constants.like(error)
+            vector = error[:, 1:]
+            sine = xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True))
+            turn = vector * (-2.0 * xp.atan2(sine, error[:, :1]) / xp.maximum(sine, small))
+            looked = frames, goal.position - state.ee_position, turn, error
+            self._seen = state, goal, looked, self._clearance(frames)
+        return self._seen[2]  # type: ignore[no-any-return]
+
+    def _nearness(self, state: SimState, goal: Goal) -> tuple[Floats, Floats]:
+        """The least distance (N,), m, and the repulsion (N, J)."""
+        self._look(state, goal)
+        return self._seen[3]  # type: ignore[no-any-return]
+
+
+def _at_scales(xp: Any, error: Floats, scales: Floats) -> Floats:
+    size = xp.sqrt(xp.sum(error * error, axis=-1, keepdims=True))
+    return xp.reshape(error[:, None] / (size[:, None] + scales[:, None]), (len(error), -1))
+
+
+def _part(name: str, size: int, values: Any, bound: float = 1.0) -> Part:
+    return Part(name, np.full(size, -bound), np.full(size, bound), values)

@@ -1,0 +1,147 @@
+"""Parts of an observation that need the arm's geometry: each is what a search or an independent formula finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from gym_mara import rotations
+from gym_mara.robot import RobotModel
+from gym_mara.state import SimState
+from gym_mara.tasks import Goal
+from gym_mara.tasks.arm_parts import DAMPING, STEP_TIME, ArmParts
+from gym_mara.testing import pickled, uniform_q
+from gym_mara.types import Floats
+from tests.helpers import robot_model, write
+
+# A carriage on a rail with two more joints, one of them along a slanted axis.
+SLIDER = """
+<robot name="slider">
+  <link name="rail"><collision><geometry><box size="2 0.1 0.1"/></geometry></collision></link>
+  <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><origin xyz="0 0 0.1"/><axis xyz="1 0 0"/>
+    <limit lower="-0.6" upper="0.7" effort="300" velocity="0.8"/></joint>
+  <link name="cart"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
+  <joint name="shoulder" type="revolute"><parent link="cart"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 0.6 0.8"/>
+    <limit lower="-2" upper="2" effort="60" velocity="1.5"/></joint>
+  <link name="upper"><collision><origin xyz="0 0 0.3"/><geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.1 0 0.5"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="30" velocity="2"/></joint>
+  <link name="lower"/>
+</robot>
+"""
+
+
+@pytest.fixture(scope="module", params=["mara", "panda", "slider"])
+def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    if request.param != "slider":
+        return robot_model(request.param)
+    path = write(tmp_path_factory.mktemp("slider") / "slider.urdf", SLIDER)
+    return RobotModel.from_urdf(path, ee_frame="lower")
+
+
+def _state(robot: RobotModel, q: Floats) -> SimState:
+    position, quaternion = robot.kinematics().pose(q)
+    count = len(q)
+    return SimState(
+        q, 0 * q, position, quaternion, np.zeros((count, 3)), np.zeros(count, bool), np.zeros(count)
+    )
+
+
+def _scene(robot: RobotModel, count: int = 30) -> tuple[SimState, Goal]:
+    """Random states, and goals that are the poses of other random configurations."""
+    goal = Goal(*robot.kinematics().pose(uniform_q(robot, count, seed=1)))
+    return _state(robot, uniform_q(robot, count, seed=2)), goal
+
+
+def _parts(robot: RobotModel, orientation: bool = True) -> ArmParts:
+    return ArmParts(robot, robot.velocity_limit, orientation, 0.2)
+
+
+def test_no_other_angle_of_a_joint_brings_the_tool_nearer(robot: RobotModel) -> None:
+    state, goal = _scene(robot)
+    ways = _parts(robot).joint_ways(state, goal)
+    kinematics = robot.kinematics()
+    for joint in range(robot.num_joints):
+        slides = bool(kinematics.prismatic[joint])
+        tried = np.linspace(-2, 2, 401) if slides else np.linspace(-np.pi, np.pi, 721)
+        q = np.repeat(state.q[:, None], len(tried), axis=1)
+        q[..., joint] += tried
+        position, _ = kinematics.pose(q.reshape(-1, robot.num_joints))
+        away = np.linalg.norm(position.reshape(*q.shape[:2], 3) - goal.position[:, None], axis=2)
+        for arm, best in enumerate(away.argmin(axis=1)):
+            if np.ptp(away[arm]) < 0.1:
+                continue  # the joint hardly changes the distance
+            off = abs(np.angle(np.exp(1j * (ways[arm, joint] - tried[best]))))
+            # It fades a little with short levers.
+            assert off < 0.02 + 0.2 * abs(tried[best]), (joint, arm)
+            assert np.sign(ways[arm, joint]) == np.sign(tried[best]) or off < 0.02
+
+
+def test_no_other_angle_of_a_joint_aligns_the_tool_better(robot: RobotModel) -> None:
+    state, goal = _scene(robot)
+    turns = _parts(robot).joint_turns(state, goal)
+    kinematics = robot.kinematics()
+    for joint in range(robot.num_joints):
+        if kinematics.prismatic[joint]:
+            assert not turns[:, joint].any()
+            continue
+        tried = np.linspace(-np.pi, np.pi, 721)
+        q = np.repeat(state.q[:, None], len(tried), axis=1)
+        q[..., joint] += tried
+        _, quaternion = kinematics.pose(q.reshape(-1, robot.num_joints))
+        angle = rotations.angle_between(
+            quaternion.reshape(*q.shape[:2], 4), goal.quaternion[:, None]
+        )
+        for arm, best in enumerate(angle.argmin(axis=1)):
+            if np.ptp(angle[arm]) > 0.3:
+                off = abs(np.angle(np.exp(1j * (turns[arm, joint] - tried[best]))))
+                assert off < 0.02 + 0.1 * abs(tried[best]), (joint, arm)
+
+
+@pytest.mark.parametrize("orientation", [False, True])
+def test_joint_steps_are_the_damped_least_squares_of_pinocchios_jacobian(
+    robot: RobotModel, orientation: bool
+) -> None:
+    state, goal = _scene(robot)
+    steps = _parts(robot, orientation).joint_steps(state, goal)
+    model, data = robot.model, robot.model.createData()
+    for arm, q in enumerate(state.q):
+        jacobian = pin.computeFrameJacobian(
+            model, data, q, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
+        )[:, : robot.num_joints]
+        w, x, y, z = goal.quaternion[arm]
+        here = data.oMf[robot.ee_frame_id]
+        turn = pin.log3(pin.Quaternion(w, x, y, z).matrix() @ here.rotation.T)
+        error = np.concatenate([goal.position[arm] - here.translation, 0.2 * turn])
+        jacobian[3:] *= 0.2
+        rows = 6 if orientation else 3
+        own = jacobian[:rows]
+        step = own.T @ np.linalg.solve(own @ own.T + DAMPING**2 * np.eye(rows), error[:rows])
+        step /= STEP_TIME * robot.velocity_limit
+        np.testing.assert_allclose(steps[arm], step / max(1.0, np.abs(step).max()), atol=1e-6)
+
+
+def test_all_parts_stay_in_their_bounds_at_the_target_and_everywhere(robot: RobotModel) -> None:
+    state, goal = _scene(robot)
+    there = _state(robot, uniform_q(robot, 30, seed=1))
+    for part in _parts(robot).parts():
+        for at in (state, there):
+            values = part.values(at, goal)
+            assert values.shape == (30, len(part.low))
+            assert np.isfinite(values).all(), part.name
+            assert (values >= part.low).all(), part.name
+            assert (values <= part.high).all(), part.name
+
+
+def test_tensors_give_the_numbers_of_arrays_and_a_copy_the_same(robot: RobotModel) -> None:
+    state, goal = _scene(robot)
+    names = ("q", "qd", "ee_position", "ee_quaternion", "ee_velocity", "collided", "time")
+    tensors = SimState(**{name: torch.tensor(getattr(state, name)) for name in names})
+    target = Goal(torch.tensor(goal.position), torch.tensor(goal.quaternion))  # type: ignore[arg-type]
+    parts = _parts(robot)
+    for part, again in zip(parts.parts(), pickled(parts).parts(), strict=True):
+        expected = part.values(state, goal)
+        np.testing.assert_array_equal(again.values(state, goal), expected)
+        np.testing.assert_allclose(part.values(tensors, target).numpy(), expected, atol=1e-11)  # type: ignore[attr-defined]
