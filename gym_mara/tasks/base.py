@@ -97,8 +97,8 @@ class Task(ABC):
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
         """The rewards (N,), and their terms by name, each (N,), which `info` reports.
 
-        Three names have a special meaning: the episode statistics use `distance` (m), and an evaluation prints
-        `position_error` (m) and `angle_error` (rad).
+        Four names have a special meaning: the episode statistics use `distance` (m), and an evaluation uses
+        `position_error` (m), `angle_error` (rad) and `success` (bool, whether the arm is within the task's tolerances).
         """
 
     def terminated(self, state: SimState, goal: Goal) -> Mask:

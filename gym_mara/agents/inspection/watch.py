@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player
-from gym_mara.agents.runs.evaluation import options_on
+from gym_mara.agents.runs.evaluation import VELOCITY_LIMIT, Player, options_on
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path, labelled
 from gym_mara.viewer import watch

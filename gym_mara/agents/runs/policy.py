@@ -148,6 +148,12 @@ def read_policy(folder: Path, preset: Preset) -> Policy:
     return Policy(network, about)
 
 
+def policy_of(model: OnPolicyAlgorithm) -> Policy:
+    """The policy of a model in training, as it would be loaded after `save_policy`."""
+    about = described(base_env(model).env.simulation, _statistics(model))
+    return Policy(model.policy, about)
+
+
 def _box(size: int) -> Box:
     return Box(-np.inf, np.inf, (size,), np.float64)
 
