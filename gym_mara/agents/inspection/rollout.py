@@ -13,7 +13,7 @@ from gym_mara.agents.runs.evaluation import chose_robot, make_arms
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import load_policy
 from gym_mara.backends import backend_settings
-from gym_mara.envs.simulation import Outcome
+from gym_mara.envs.outcome import Outcome
 from gym_mara.registration import environment
 from gym_mara.types import Floats, Mask
 
@@ -50,7 +50,9 @@ class Player:
         self.policy = load_policy(run, which)
         self.episode_steps = environment(config.env).max_episode_steps
         """The length of an episode, steps."""
-        self.env = make_arms(config.env, backend, episodes, options, max_episode_steps=None)
+        self.options = self.policy.about.keywords(backend, options)
+        """The keyword arguments of the environment, with the policy's action mode and steps."""
+        self.env = make_arms(config.env, backend, episodes, self.options, max_episode_steps=None)
         try:
             self.policy.check(self.env.simulation, any_robot=chose_robot(options))
             self._observation, _ = self.env.reset(seed=config.seed)
@@ -59,7 +61,7 @@ class Player:
             raise
 
     def act(self, observation: Floats) -> Floats:
-        """The joint targets (N, J), rad, for observations (N, O)."""
+        """The actions (N, A) for observations (N, O)."""
         return self.policy.predict(observation)[0]
 
     def step(self) -> Outcome:

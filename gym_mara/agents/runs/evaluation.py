@@ -49,7 +49,7 @@ def make_env(
 ) -> MaraVecEnv:
     """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
     arms = make_arms(env, backend, num_envs, options, **limit)
-    return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
+    return MaraVecEnv(arms, unit_box(len(arms.simulation.action_space.low)))
 
 
 def episodes_to_judge(config: RunConfig) -> int:
@@ -92,7 +92,7 @@ def evaluate_run(
     config = run.config
     policy = load_policy(run, which)
     backend = backend or config.backend
-    settings = options_on(backend, config, options)
+    settings = policy.about.keywords(backend, options_on(backend, config, options))
     env = MaraVecEnv(make_arms(config.env, backend, episodes, settings))
     try:
         policy.check(env.env.simulation, any_robot=chose_robot(settings))
