@@ -49,6 +49,9 @@ class Task(ABC):
     random_goal: ClassVar[bool] = False
     """Whether `draw_goal` draws a new goal for each episode."""
 
+    default_action: ClassVar[str] = "absolute"
+    """The action mode of the environments unless the keyword argument `action` chooses one."""
+
     on_collision: str = "reset"
     """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or
     "continue"."""

@@ -9,6 +9,7 @@ import numpy as np
 from gym_mara.agents.evaluation.episodes import arms_of_a_batch, play_episodes
 from gym_mara.agents.evaluation.rollout import Begin
 from gym_mara.agents.runs.evaluation import make_arms
+from gym_mara.envs.actions import AbsoluteActions, RelativeActions
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.registration import environment
@@ -53,23 +54,22 @@ class StraightMove:
             ]
         )
         # How far ahead of a joint its target must be for the joint to move at its limit in the next period.
-        gain = getattr(backend, "servo_gain", None)
+        gain = backend.servo_gain
         lead = backend.control_period + (0.0 if gain is None else 1.0 / gain)
         self._reach = backend.joint_velocity * lead
-        self._actions = getattr(simulation, "actions", None)
-        if self._actions is not None and self._actions.mode not in ("absolute", "relative"):
+        if not isinstance(simulation.actions, (AbsoluteActions, RelativeActions)):
             raise GymMaraError(
-                f"the straight joint move has no {self._actions.mode} actions: give --set action=relative or absolute"
+                f"a straight joint move has no {simulation.actions.mode} actions: give action=relative or action=absolute"
             )
 
     def __call__(self, observation: Any) -> Floats:
         """The actions (N, J) of the next step."""
-        q = self._simulation.backend.state.q
+        q, actions = self._simulation.backend.state.q, self._simulation.actions
         way = self._goal - q
         target = q + way / np.maximum(_most(way, self._reach), 1.0)
-        if self._actions is None or self._actions.mode == "absolute":
+        if not isinstance(actions, RelativeActions):
             return target
-        step, scale = target - self._actions.origin, self._actions.steps
+        step, scale = target - actions.origin, actions.steps
         step = step / np.maximum(_most(step, scale), 1.0)
         return np.divide(step, scale, out=np.zeros_like(step), where=scale > 0.0)
 

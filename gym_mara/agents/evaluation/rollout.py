@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from gym_mara.envs import MaraVectorEnv
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
 from gym_mara.types import Floats, Mask
 
 Act = Callable[[Any], Floats]

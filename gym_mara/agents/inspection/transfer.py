@@ -17,6 +17,7 @@ from gym_mara.agents.runs.evaluation import (
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import backend_settings, usable_backends
 from gym_mara.envs import task_keywords
+from gym_mara.envs.actions import ActionSettings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import unknown
 from gym_mara.robot.options import ROBOT_KEYWORDS
@@ -70,8 +71,8 @@ def transfer(
         for reason in reasons:
             warnings.warn(f"left out: {reason}", stacklevel=2)
     settings = {name: backend_settings(name) for name in backends}
-    sensors = {field.name for field in fields(SensorSettings)}
-    everywhere = {*ROBOT_KEYWORDS, *task_keywords(run.config.env), *sensors}
+    of_env_too = {f.name for form in (SensorSettings, ActionSettings) for f in fields(form)}
+    everywhere = {*ROBOT_KEYWORDS, *task_keywords(run.config.env), *of_env_too}
     for name in given:
         valid = everywhere.union(*settings.values())
         if name not in valid:

@@ -101,7 +101,7 @@ def watch_run(
     """
     settings = _settings(run, backend, options, which, log)
     with Player(run, backend, settings, which=which) as player:
-        act = player.act
+        act, settings = player.act, player.options
     watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
 
 

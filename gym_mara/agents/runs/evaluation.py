@@ -15,7 +15,8 @@ from gym_mara.agents.sb3 import MaraVecEnv, require_numpy
 from gym_mara.agents.scaling import unit_box
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
 from gym_mara.registration import environment
 from gym_mara.robot import RobotModel
 from gym_mara.robot.options import ROBOT_KEYWORDS
@@ -48,7 +49,7 @@ def make_env(
 ) -> MaraVecEnv:
     """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
     arms = make_arms(env, backend, num_envs, options, **limit)
-    return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
+    return MaraVecEnv(arms, unit_box(len(arms.simulation.action_space.low)))
 
 
 def episodes_to_judge(config: RunConfig) -> int:
@@ -89,7 +90,9 @@ class Player:
         self.policy = load_policy(run, which)
         self.episode_steps = environment(config.env).max_episode_steps
         """The length of an episode, steps."""
-        self.env = make_arms(config.env, backend, arms, options, max_episode_steps=None)
+        self.options = self.policy.about.keywords(backend, options)
+        """The keyword arguments of the environment, with the policy's action mode and steps."""
+        self.env = make_arms(config.env, backend, arms, self.options, max_episode_steps=None)
         try:
             self.policy.check(self.env.simulation, any_robot=chose_robot(options))
             self._observation, _ = self.env.reset(seed=episode_seeds(0, 0, arms))
@@ -98,7 +101,7 @@ class Player:
             raise
 
     def act(self, observation: Floats) -> Floats:
-        """The joint targets (N, J), rad, for observations (N, O)."""
+        """The actions (N, A) for observations (N, O)."""
         return self.policy.predict(observation)[0]
 
     def step(self) -> Outcome:

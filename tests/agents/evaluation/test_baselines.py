@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,10 +12,9 @@ import pytest
 from gym_mara.agents.evaluation import baselines
 from gym_mara.agents.evaluation.baselines import StraightMove, evaluate_baseline
 from gym_mara.agents.evaluation.episodes import episode_seeds
-from gym_mara.agents.evaluation.metrics import measure
+from gym_mara.agents.evaluation.metrics import measure, settling_time
 from gym_mara.agents.evaluation.rollout import Trajectory, roll_out
 from gym_mara.agents.runs.evaluation import make_arms
-from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import Environment, environment
 from gym_mara.robot import RobotModel
@@ -80,36 +77,31 @@ def test_it_takes_a_solution_near_the_start(mara: RobotModel) -> None:
         np.testing.assert_allclose(q, start + 0.05, atol=1e-6)
 
 
-@pytest.fixture
-def arms() -> Iterator[MaraVectorEnv]:
-    """Two arms at the start of an episode."""
-    made = make_arms("MARARandomTarget-v0", "pinocchio", 2, TRAVELLING, max_episode_steps=None)
-    with contextlib.closing(made):
-        made.reset(seed=[1, 2])
-        yield made
+@pytest.mark.parametrize("backend", ["pinocchio", "dart"])
+@pytest.mark.parametrize("reference", ["position", "target"])
+def test_relative_actions_make_the_same_move(backend: str, reference: str) -> None:
+    options = {"max_joint_velocity": 1.0}
+    relative = {**options, "action": "relative", "action_from": reference}
+    absolute = moved("MARARandomTarget-v0", backend, options)
+    played = moved("MARARandomTarget-v0", backend, relative)
+    assert played.position_error[-1].max() < 1e-4
+    slack = 1e-9 if reference == "position" else 0.3  # a target that runs ahead starts slowly
+    np.testing.assert_allclose(settling_time(played), settling_time(absolute), rtol=0.0, atol=slack)
 
 
-@pytest.mark.parametrize("scale", [0.05, 0.01, [0.05, 0.0, 0.01, 0.05, 0.05, 0.05]])
-def test_relative_actions_ask_for_the_same_line(arms: MaraVectorEnv, scale: Any) -> None:
-    simulation = arms.simulation
-    target = StraightMove(simulation)(None)
-    origin = simulation.backend.state.q + 0.001
-    steps = np.broadcast_to(scale, 6)
-    relative: Any = SimpleNamespace(mode="relative", steps=steps, origin=origin)
-    vars(simulation)["actions"] = relative
-    action = StraightMove(simulation)(None)
-    assert np.abs(action).max() <= 1.0 + 1e-12
-    wanted, asked = target - origin, action * steps
-    movable = steps > 0.0
-    longest = np.maximum((np.abs(wanted) / np.where(movable, steps, np.inf)).max(1), 1.0)
-    np.testing.assert_allclose(asked[:, movable], (wanted / longest[:, None])[:, movable])
-    assert not asked[:, ~movable].any()
+@pytest.mark.parametrize("scale", [0.005, [0.005, 0.01, 0.002, 0.005, 0.005, 0.005]])
+def test_shorter_steps_make_a_slower_straight_move(scale: Any) -> None:
+    options = {**TRAVELLING, "action": "relative", "action_scale": scale}
+    played = moved("MARARandomTarget-v0", "pinocchio", options, 1000)
+    assert played.position_error[-1].max() < 1e-6
+    way = played.q[-1] - played.start
+    share = (played.q - played.start) / np.where(np.abs(way) > 1e-3, way, np.nan)
+    assert np.nanmax(np.nanmax(share, axis=2) - np.nanmin(share, axis=2)) < 1e-6
 
 
-def test_a_twist_of_the_tool_is_no_joint_move(arms: MaraVectorEnv) -> None:
-    vars(arms.simulation)["actions"] = SimpleNamespace(mode="cartesian")
-    with pytest.raises(GymMaraError, match="no cartesian actions: give --set action=relative"):
-        StraightMove(arms.simulation)
+def test_a_twist_of_the_tool_is_no_joint_move() -> None:
+    with pytest.raises(GymMaraError, match="has no cartesian actions: give action=relative"):
+        moved("MARARandomTarget-v0", "pinocchio", {"action": "cartesian"})
 
 
 @dataclass(frozen=True)

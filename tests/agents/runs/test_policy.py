@@ -177,7 +177,13 @@ NUMBERS = {"mean": [0.0] * 16, "var": [1.0] * 16, "epsilon": 1e-8, "clip": 10.0}
 @pytest.mark.parametrize(
     "changes",
     [
-        {"format": 2},
+        {"format": 3},
+        {"format": 1},
+        {"action": {"mode": "relative", "steps": [], "reference": "position"}},
+        {"action": {"mode": "absolute", "steps": [0.1] * 6, "reference": "position"}},
+        {"action": {"mode": "cartesian", "steps": [-0.1] * 6, "reference": "position"}},
+        {"action": {"mode": "sideways", "steps": [], "reference": "position"}},
+        {"control_period": 0.0},
         {"joints": []},
         {"joints": ["a"]},
         {"low": [0.0] * 5},
