@@ -93,8 +93,8 @@ class SimState:
         vars(state).update(vars(self), q=q)
         return state
 
-    def with_actions(self, action: Floats, last_action: Floats) -> SimState:
-        """The same state with the last action of each arm and the one before it, each (N, A)."""
-        state = object.__new__(SimState)
-        vars(state).update(vars(self), action=action, last_action=last_action)
-        return state
+    def fill_actions(self, action: Floats, last_action: Floats) -> None:
+        """Set the last action of each arm and the one before it, each (N, A), in a state that nobody else has yet."""
+        vars(self).update(
+            action=action, last_action=last_action
+        )  # a copy would take four times as long
