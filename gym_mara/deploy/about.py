@@ -145,8 +145,10 @@ class About:
         if not all(low <= high for low, high in ranges):
             raise GymMaraError("a lower bound is above the upper one")
         limits = [limit for j in joints for limit in (j.velocity, j.travel) if limit is not None]
-        if not all(value > 0.0 for value in (self.control_period, *limits, *action.steps)):
-            raise GymMaraError("the control period, velocities, travels and steps must be positive")
+        if not all(value > 0.0 for value in (self.control_period, *limits)):
+            raise GymMaraError("the control period, velocities and travels must be positive")
+        if min(action.steps, default=0.0) < 0.0:
+            raise GymMaraError("the steps of actions must not be negative")
         if not self.observation or not all(part.size > 0 for part in self.observation):
             raise GymMaraError("an observation must have parts, each with at least one value")
 

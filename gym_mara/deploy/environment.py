@@ -58,7 +58,11 @@ def action_of(simulation: Any) -> Action:
     """What the actions of a simulation mean."""
     space = simulation.action_space
     low, high = (tuple(map(float, bounds)) for bounds in (space.low, space.high))
-    return Action("absolute", low, high, (), "position")
+    actions = getattr(simulation, "actions", None)
+    if actions is None:
+        return Action("absolute", low, high, (), "position")
+    steps = tuple(map(float, actions.steps))
+    return Action(actions.mode, low, high, steps, actions.settings.action_from)
 
 
 def _parts(simulation: Any) -> tuple[Part, ...]:

@@ -133,21 +133,18 @@ class OnnxPolicy:
                 "cartesian actions are twists of the end effector, action · about.action.steps: give them to a controller that "
                 "follows twists"
             )
-        here = _rows("q", q, joints)
+        here = start = _rows("q", q, joints)
         asked = np.clip(_rows("action", action, joints), self._low, self._high)
+        if about.mode == "relative" and about.reference == "target":
+            if last_target is None:
+                raise GymMaraError(
+                    "the actions start from the last targets: give last_target, at the start of an episode q"
+                )
+            start = _rows("last_target", last_target, joints)
+        if len(shapes := {asked.shape, here.shape, start.shape}) > 1:
+            raise GymMaraError(f"the arrays must be of equally many arms, not of shapes {shapes}")
         if about.mode == "relative":
-            start = here
-            if about.reference == "target":
-                if last_target is None:
-                    raise GymMaraError(
-                        "the actions start from the last targets: give last_target, at the start of an episode q"
-                    )
-                start = _rows("last_target", last_target, joints)
             asked = start + asked * self._steps
-        if asked.shape != here.shape:
-            raise GymMaraError(
-                f"the arrays must be of equally many arms, not of shape {asked.shape} and {here.shape}"
-            )
         near = np.clip(asked, here - self._travel, here + self._travel)
         return np.clip(near, self._lower, self._upper)
 

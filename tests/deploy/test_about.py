@@ -70,7 +70,7 @@ def changed(path: str, value: Any) -> str:
         ("action.reference", "", "unknown reference of actions"),
         ("action.low", [-1.0], "do not fit together"),
         ("action.low", [2.0] * 3, "a lower bound is above"),
-        ("action.steps", [0.1, -0.1, 0.1], "must be positive"),
+        ("action.steps", [0.1, -0.1, 0.1], "must not be negative"),
         ("control_period", 0, "must be positive"),
         ("target", 5, "target must be of the type str"),
         ("observation", [], "must have parts"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -213,6 +215,12 @@ def test_wrong_arrays_are_errors(tmp_path: Path, arrays: Any, message: str) -> N
         policy(tmp_path, FROM_TARGET).targets(*arrays)
 
 
+@pytest.mark.parametrize("action", [ABSOLUTE, RELATIVE])
+def test_the_arms_of_an_action_are_those_of_the_positions(tmp_path: Path, action: Any) -> None:
+    with pytest.raises(GymMaraError, match="equally many arms"):
+        policy(tmp_path, action).targets(np.zeros((2, 3)), np.zeros((3, 3)))
+
+
 # Files.
 
 
@@ -274,3 +282,55 @@ def test_a_model_reads_no_other_file(tmp_path: Path) -> None:
     )
     with pytest.raises(DamagedFileError, match="onnxruntime does not take it"):
         OnnxPolicy(tmp_path / "policy.onnx")
+
+
+# The page.
+
+
+class FakeRobot:
+    """A robot that goes where it is told, for a few periods."""
+
+    def __init__(self) -> None:
+        self.q, self.periods = np.zeros(3), 0
+
+    def is_running(self) -> bool:
+        self.periods += 1
+        return self.periods <= 5
+
+    def joint_positions(self) -> Any:
+        return self.q.copy()
+
+    def tool_position(self) -> Any:
+        return np.array([0.3])
+
+    def tool_velocity(self) -> Any:
+        return np.array([0.1])
+
+    def move_to(self, target: Any) -> None:
+        self.q = target
+
+
+def test_the_example_of_the_page_moves_a_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    policy(tmp_path, FROM_TARGET)  # writes policy.onnx
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    robot = FakeRobot()
+    exec(example, {"robot": robot, "goal": np.zeros(1)})
+    assert robot.periods == 6
+    assert (robot.q > 0.0).all()
+
+
+def test_the_page_names_every_entry_of_the_metadata() -> None:
+    text = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8").split("## The metadata")[1]
+
+    def names(value: Any) -> set[str]:
+        if isinstance(value, dict):
+            return {*value} | {n for v in value.values() for n in names(v)}
+        return {n for v in value for n in names(v)} if isinstance(value, list) else set()
+
+    values = json.loads(about().to_json())
+    assert [name for name in names(values) if f"`{name}`" not in text] == []

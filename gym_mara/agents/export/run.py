@@ -90,7 +90,10 @@ def _about(run: RunFolder, which: str, policy: PolicyDescription, env: MaraVecto
 
 def _action(policy: PolicyDescription) -> Action:
     """What the actions of a policy mean."""
-    return Action("absolute", tuple(policy.low), tuple(policy.high), (), "position")
+    low, high, action = tuple(policy.low), tuple(policy.high), getattr(policy, "action", None)
+    if action is None:
+        return Action("absolute", low, high, (), "position")
+    return Action(action.mode, low, high, tuple(action.steps), action.reference)
 
 
 def _without_folders(value: Any) -> Any:
