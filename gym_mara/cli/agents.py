@@ -1,4 +1,4 @@
-"""gym-mara train, evaluate and transfer: the commands for one run."""
+"""gym-mara train, evaluate, transfer and export: the commands for one run."""
 
 from __future__ import annotations
 
@@ -228,6 +228,24 @@ def transfer(
     for name, title in METRICS.items():
         table.add_row(title, *(mean_in_short(name, row.metrics[name]) for row in rows))
     out.print(table)
+
+
+def export(
+    run: RunArgument,
+    file: Annotated[Path, typer.Argument(help="The new file, such as policy.onnx.")],
+    policy: PolicyOption = "last",
+) -> None:
+    """Export a run's policy as one ONNX file, for a robot: gym_mara.deploy.OnnxPolicy plays it without torch.
+
+    Needs the extra train.
+    """
+    with needs_agents():
+        from gym_mara.agents.export.run import export as write
+        from gym_mara.agents.runs.folder import RunFolder
+
+    with interruptible("Interrupted; no file was written."):
+        about = write(RunFolder.open(run), file, which=policy)
+    out.print(f"{file}: {about.action.mode} actions for {about.robot.name}", soft_wrap=True)
 
 
 @contextmanager

@@ -35,6 +35,7 @@ app = typer.Typer(
 app.command()(agents.train)
 app.command()(agents.evaluate)
 app.command()(agents.transfer)
+app.command()(agents.export)
 app.command()(viewing.watch)
 app.command()(viewing.report)
 app.command()(experiments.benchmark)

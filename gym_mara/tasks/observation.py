@@ -38,6 +38,8 @@ class Part:
     """Computes the values (N, K) for N arms; a module-level function, so that environments can be pickled."""
     joint_limits: bool = False
     """Whether the bounds are joint limits, which joints with dynamics may overshoot."""
+    unit: str = ""
+    """The unit of the values, such as "m/s"; "joint" for that of each joint, rad (m), and "" for none. Exported policies name it."""
 
 
 class Observation:
@@ -87,7 +89,14 @@ class Observation:
 
 def joint_positions(robot: RobotModel) -> Part:
     """The joint positions (J,), rad (m for a prismatic joint)."""
-    return Part("joint_positions", robot.lower, robot.upper, _joint_positions, joint_limits=True)
+    return Part(
+        "joint_positions",
+        robot.lower,
+        robot.upper,
+        _joint_positions,
+        joint_limits=True,
+        unit="joint",
+    )
 
 
 def joint_velocities(joint_velocity: Floats) -> Part:
@@ -114,7 +123,7 @@ def position_error(robot: RobotModel, farthest: float) -> Part:
         robot: the arm.
         farthest: the largest possible distance of a target from the world's origin, m.
     """
-    return _symmetric("position_error", robot.extent + farthest, _position_error)
+    return _symmetric("position_error", robot.extent + farthest, _position_error, "m")
 
 
 def orientation_error() -> Part:
@@ -129,12 +138,13 @@ def tool_velocity(robot: RobotModel, joint_velocity: Floats) -> Part:
         robot: the arm.
         joint_velocity: the largest speed of each joint (J,), rad/s.
     """
-    return _symmetric("tool_velocity", float((robot.reach * joint_velocity).sum()), _tool_velocity)
+    fastest = float((robot.reach * joint_velocity).sum())
+    return _symmetric("tool_velocity", fastest, _tool_velocity, "m/s")
 
 
 def tool_position(robot: RobotModel) -> Part:
     """The position of the end effector in the world frame (3,), m."""
-    return _symmetric("tool_position", robot.extent, _tool_position)
+    return _symmetric("tool_position", robot.extent, _tool_position, "m")
 
 
 def tool_quaternion() -> Part:
@@ -144,7 +154,7 @@ def tool_quaternion() -> Part:
 
 def target_position(robot: RobotModel) -> Part:
     """The position of the target in the world frame (3,), m, for targets within reach."""
-    return _symmetric("target_position", robot.extent, _target_position)
+    return _symmetric("target_position", robot.extent, _target_position, "m")
 
 
 def target_quaternion() -> Part:
@@ -152,8 +162,10 @@ def target_quaternion() -> Part:
     return _quaternion("target_quaternion", _target_quaternion)
 
 
-def _symmetric(name: str, bound: float, values: Callable[[SimState, Goal], Floats]) -> Part:
-    return Part(name, np.full(3, -bound), np.full(3, bound), values)
+def _symmetric(
+    name: str, bound: float, values: Callable[[SimState, Goal], Floats], unit: str
+) -> Part:
+    return Part(name, np.full(3, -bound), np.full(3, bound), values, unit=unit)
 
 
 def _quaternion(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:

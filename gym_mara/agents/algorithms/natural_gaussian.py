@@ -181,6 +181,27 @@ class NaturalGaussianPolicy(MarksUnitActions, ActorCriticPolicy):
     def _symmetric_log_scale(self) -> Tensor:
         return 0.5 * self.covariance_rate * (self.log_scale + self.log_scale.T)
 
+    @torch.no_grad()
+    def action_layer(self) -> nn.Linear:
+        """The linear layer from the last hidden layer to the most probable action, a = c + F e^S m, computed in float64."""
+        weight, bias, learnt, centre, factor = (
+            value.double()
+            for value in (
+                self.action_net.weight,
+                self.action_net.bias,
+                self._symmetric_log_scale(),
+                self.centre,
+                self.factor,
+            )
+        )
+        scale = factor @ torch.matrix_exp(learnt)
+        layer: nn.Linear = nn.utils.skip_init(  # type: ignore[no-untyped-call]
+            nn.Linear, weight.shape[1], weight.shape[0]
+        )
+        layer.weight.copy_(scale @ weight)
+        layer.bias.copy_(centre + scale @ (self.bias_rate * bias))
+        return layer
+
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Actions, values and log-probabilities for the states of a rollout."""
         result = super().forward(obs, deterministic)
