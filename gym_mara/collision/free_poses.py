@@ -14,7 +14,7 @@ from gym_mara.types import Floats
 
 _TRIES = 10_000
 _STEP = 0.05
-"""The longest way of any point of the arm between two checks of a move, m."""
+"""How far a joint moves at most between two checks of a move, rad (m)."""
 
 
 class FreePoses:
@@ -61,9 +61,9 @@ class FreePoses:
         )
 
     def _move(self, begin: Floats, end: Floats) -> Floats:
-        """The configurations between two (K, J) on the straight joint move, no point of the arm more than _STEP apart."""
+        """The configurations before the end of a straight joint move (K, J), at most _STEP apart."""
         way = end - begin
-        count = math.ceil(float((np.abs(way) * self._robot.reach).sum()) / _STEP)
+        count = math.ceil(float(np.abs(way).max()) / _STEP)
         return begin + np.linspace(0.0, 1.0, count + 1)[:-1, None] * way
 
     def _pose(self, q: Floats) -> tuple[Floats, Floats]:

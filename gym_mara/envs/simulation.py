@@ -19,12 +19,13 @@ from gym_mara.envs.options import Options
 from gym_mara.envs.outcome import Outcome, report
 from gym_mara.envs.sensors import Sensors, check_noise, noise_of
 from gym_mara.envs.statistics import EpisodeStatistics
-from gym_mara.envs.streams import Streams, check_streams, drawn_goals, parameter_seeds
+from gym_mara.envs.streams import Streams, check_streams, drawn_episodes, parameter_seeds
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
+from gym_mara.tasks.observation import last_action
 from gym_mara.types import Floats, Mask
 
 
@@ -69,10 +70,14 @@ class Simulation:
         noise = noise_of(self.backend.state)
         check_noise(options.sensors, noise, tensors=self._tensor is not None)
         self._sensors = self._new_sensors()
-        self.observation = Observation(
-            self.task.observation(self.robot, goal, self.backend.joint_velocity),
-            self.backend.overshoot,
-        )
+        self.actions = self._new_actions()
+        """What actions mean, and the last ones."""
+        self.action_space: Box[np.float32] = self.actions.space
+        """The space of one arm's actions."""
+        parts = self.task.observation(self.robot, goal, self.backend.joint_velocity)
+        if self.task.observes_action:
+            parts = [*parts, last_action(self.action_space)]
+        self.observation = Observation(parts, self.backend.overshoot)
         overshoot = self.backend.overshoot
         self._observed_range = (
             asarray(self.robot.lower - overshoot),
@@ -80,10 +85,6 @@ class Simulation:
         )
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
-        self.actions = self._new_actions()
-        """What actions mean, and the last ones."""
-        self.action_space: Box[np.float32] = self.actions.space
-        """The space of one arm's actions."""
         # The range of joint targets (J,), rad (m).
         self.target_low, self.target_high = self.actions.target_low, self.actions.target_high
 
@@ -117,16 +118,23 @@ class Simulation:
         return self._observe(state, noise), report(state)
 
     def _draw(self, chosen: Mask) -> None:
-        """Draw the random parameters and goals of new episodes; the mask (N,) is NumPy's, because each arm has its generators."""
+        """Draw the random parameters, starts and goals of new episodes.
+
+        The mask (N,) is NumPy's, because each arm has its own generators.
+        """
         if self.backend.random:
             self.backend.begin_episodes(parameter_seeds(self.streams, chosen), chosen)
         if self.task.random_goal:
-            drawn = drawn_goals(self.task, self._workspace, self.streams, chosen)
-            asarray, old = self.backend.asarray, self.goal
-            xp, rows = namespace(old.position), asarray(chosen)[:, None]
-            position, quaternion = (
-                xp.where(rows, asarray(new), kept)
-                for new, kept in zip(drawn, (old.position, old.quaternion), strict=True)
+            drawn = drawn_episodes(
+                self.task, self._workspace, self.streams, chosen, host(self._start)
+            )
+            asarray, old = (
+                self.backend.asarray,
+                (self._start, self.goal.position, self.goal.quaternion),
+            )
+            xp, rows = namespace(self._start), asarray(chosen)[:, None]
+            self._start, position, quaternion = (
+                xp.where(rows, asarray(new), kept) for new, kept in zip(drawn, old, strict=True)
             )
             self.goal = Goal(position, quaternion)
 
@@ -190,7 +198,10 @@ class Simulation:
         return self.outcome
 
     def rewards(self, state: SimState) -> tuple[Floats, dict[str, NDArray[Any]]]:
-        """The rewards (N,) of a state without sensor noise, and their terms."""
+        """The rewards (N,) of a state without sensor noise, and their terms; a state without actions gets the last ones."""
+        if state.action is None:
+            state = copy.copy(state)
+            state.fill_actions(self.actions.action, self.actions.last_action)
         return self._reward(state, self._observe(state, None))
 
     def _reward(
@@ -302,6 +313,7 @@ class Simulation:
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
             "goal": self._host_goal(),
+            "start": host(self._start).copy(),
         }
 
     def _host_goal(self) -> tuple[Floats, Floats]:
@@ -334,6 +346,7 @@ class Simulation:
             "streams": tuple,
             "started": bool,
             "goal": self._host_goal(),
+            "start": host(self._start),
         }
         check_fits("snapshot", snapshot, form | others)
         steps = host(self.statistics.steps)
@@ -358,6 +371,7 @@ class Simulation:
         self._started = snapshot["started"]
         self.outcome = None
         self.goal = Goal(*(self.backend.asarray(values.copy()) for values in snapshot["goal"]))
+        self._start = self.backend.asarray(snapshot["start"].copy())
 
     def close(self) -> None:
         """Free the backend. A second call has no effect."""

@@ -10,7 +10,7 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from gym_mara.snapshots import check_fits
-from gym_mara.tasks import Task, Workspace
+from gym_mara.tasks import Draw, Task, Workspace
 from gym_mara.types import Floats, Mask
 
 
@@ -18,7 +18,7 @@ class Streams(NamedTuple):
     """Independent random generators, spawned from the generator of the environment."""
 
     goals: np.random.Generator
-    """Draws the goal of each episode."""
+    """Draws the start and the goal of each episode."""
     parameters: np.random.Generator
     """Seeds the physical parameters of each episode."""
     sensors: np.random.Generator
@@ -48,14 +48,28 @@ def parameter_seeds(streams: Sequence[Streams], chosen: Mask) -> NDArray[np.uint
     return seeds
 
 
-def drawn_goals(
-    task: Task, workspace: Workspace, streams: Sequence[Streams], chosen: Mask
-) -> tuple[Floats, Floats]:
-    """The goals of new episodes of the chosen arms (N,): positions (N, 3), m, and quaternions (N, 4); zero for other arms."""
+def drawn_episodes(
+    task: Task, workspace: Workspace, streams: Sequence[Streams], chosen: Mask, start: Floats
+) -> Draw:
+    """What is drawn for new episodes of the chosen arms (N,).
+
+    Args:
+        task: it draws.
+        workspace: of the arms.
+        streams: the random generators of each arm.
+        chosen: NumPy's mask (N,).
+        start: the start configurations so far (N, J), rad; they stay for the other arms, and where the task draws none.
+
+    Returns:
+        Start configurations (N, J), rad, and goals: positions (N, 3), m, and quaternions (N, 4), zero for the other arms.
+    """
+    start = start.copy()
     position, quaternion = np.zeros((len(chosen), 3)), np.zeros((len(chosen), 4))
     for arm in np.flatnonzero(chosen).tolist():
-        position[arm], quaternion[arm] = task.draw_goal(workspace, streams[arm].goals)
-    return position, quaternion
+        own, position[arm], quaternion[arm] = task.draw(workspace, streams[arm].goals)
+        if own is not None:
+            start[arm] = own
+    return Draw(start, position, quaternion)
 
 
 def check_streams(streams: Any, num_envs: int) -> None:
