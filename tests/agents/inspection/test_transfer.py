@@ -87,11 +87,11 @@ def test_a_backend_that_this_machine_cannot_run_is_left_out_with_the_reason(
 
 @pytest.mark.usefixtures("_short_episodes")
 def test_an_option_of_the_task_counts_on_every_backend(finished_run: RunFolder) -> None:
-    options: dict[str, Any] = {"target_position": [-0.3, 0.1, 0.8], "servo_gain": 50.0}
+    options: dict[str, Any] = {"target_position": [-0.3, 0.1, 0.8], "physics_step": 0.002}
     backends = ["dart", "pinocchio"]
     rows = transfer(finished_run, backends=backends, options=options)
     assert not any("target_position" in row.settings for row in rows), "it is the same for all"
-    assert all(("servo_gain" in row.settings) == (row.backend == "dart") for row in rows)
+    assert all(("physics_step" in row.settings) == (row.backend == "dart") for row in rows)
     before = transfer(finished_run, backends=backends)
     assert rows[0].position_error_mm != before[0].position_error_mm
 
