@@ -216,15 +216,15 @@ class PolicyDescription(_Description):
 
         Args:
             backend: the name of the backend.
-            options: keyword arguments that are given; the policy's action mode and steps are added, and for steps the
-                policy's control period, because they are made for it.
+            options: those of the policy's run or given by the user. The steps of the policy are added, and its control
+                period, because they are made for it.
         """
-        own = self.action.keywords
-        if options.get("action", self.action.mode) != self.action.mode:
-            return options  # `check` says what is wrong
-        if self.action.mode != "absolute" and "control_period" in backend_settings(backend):
-            own["control_period"] = self.control_period
-        return own | options
+        own = self.action
+        if own.mode == "absolute" or options.get("action", own.mode) != own.mode:
+            return options  # `check` says what does not fit
+        period = {"control_period": self.control_period}
+        known = "control_period" in backend_settings(backend)
+        return own.keywords | (period if known else {}) | options
 
 
 def read_description(folder: Path) -> PolicyDescription:
