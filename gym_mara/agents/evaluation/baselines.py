@@ -34,8 +34,13 @@ class StraightMove:
 
     def __init__(self, simulation: Simulation) -> None:
         task, robot, backend = simulation.task, simulation.robot, simulation.backend
-        start = backend.state.q
-        if "position_error" not in simulation.rewards(backend.state)[1]:
+        actions, state = simulation.actions, backend.state
+        if not isinstance(actions, (AbsoluteActions, RelativeActions)):
+            raise GymMaraError(
+                f"a straight joint move has no {actions.mode} actions: give action=relative or action=absolute"
+            )
+        state.fill_actions(actions.action, actions.last_action)
+        if "position_error" not in simulation.rewards(state)[1]:
             raise GymMaraError(
                 f"inverse kinematics needs a task with a pose to reach, and the info of {type(task).__name__} has no "
                 "position_error: choose another --env, or evaluate a trained policy"
@@ -48,7 +53,7 @@ class StraightMove:
                 for position, quaternion, q in zip(
                     goal.position,
                     goal.quaternion,
-                    start.clip(robot.lower, robot.upper),
+                    state.q.clip(robot.lower, robot.upper),
                     strict=True,
                 )
             ]
@@ -57,10 +62,6 @@ class StraightMove:
         gain = backend.servo_gain
         lead = backend.control_period + (0.0 if gain is None else 1.0 / gain)
         self._reach = backend.joint_velocity * lead
-        if not isinstance(simulation.actions, (AbsoluteActions, RelativeActions)):
-            raise GymMaraError(
-                f"a straight joint move has no {simulation.actions.mode} actions: give action=relative or action=absolute"
-            )
 
     def __call__(self, observation: Any) -> Floats:
         """The actions (N, J) of the next step."""

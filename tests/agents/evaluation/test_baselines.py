@@ -118,6 +118,22 @@ def test_a_task_without_a_pose_has_no_baseline(monkeypatch: pytest.MonkeyPatch) 
         evaluate_baseline("ik", "Still-v0", backend="pinocchio", episodes=1)
 
 
+@dataclass(frozen=True)
+class Smooth(ReachTask):
+    """A task that judges actions, too."""
+
+    def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
+        reward, terms = super().reward(state, goal)
+        assert state.action is not None
+        assert state.last_action is not None
+        return reward - np.square(state.action - state.last_action).sum(axis=1), terms
+
+
+def test_a_task_that_judges_actions_has_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(registry.TASKS, "Smooth-v0", Smooth())
+    assert moved("Smooth-v0", "pinocchio", {}).position_error[-1].max() < 1e-6
+
+
 def test_an_unknown_baseline_is_an_error() -> None:
     with pytest.raises(GymMaraError, match="unknown baseline 'ikk'"):
         evaluate_baseline("ikk", "MARA-v0", backend="pinocchio")
