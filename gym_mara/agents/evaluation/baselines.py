@@ -34,12 +34,12 @@ class StraightMove:
 
     def __init__(self, simulation: Simulation) -> None:
         task, robot, backend = simulation.task, simulation.robot, simulation.backend
-        actions, start = simulation.actions, backend.state.q
+        actions, state = simulation.actions, backend.state
         if not isinstance(actions, (AbsoluteActions, RelativeActions)):
             raise GymMaraError(
                 f"a straight joint move has no {actions.mode} actions: give action=relative or action=absolute"
             )
-        state = backend.state.with_actions(actions.action, actions.last_action)
+        state.fill_actions(actions.action, actions.last_action)
         if "position_error" not in simulation.rewards(state)[1]:
             raise GymMaraError(
                 f"inverse kinematics needs a task with a pose to reach, and the info of {type(task).__name__} has no "
@@ -53,7 +53,7 @@ class StraightMove:
                 for position, quaternion, q in zip(
                     goal.position,
                     goal.quaternion,
-                    start.clip(robot.lower, robot.upper),
+                    state.q.clip(robot.lower, robot.upper),
                     strict=True,
                 )
             ]
