@@ -26,7 +26,7 @@ def interface(simulation: Any) -> Interface:
     robot, backend = simulation.robot, simulation.backend
     velocity = robot.velocity_limit if backend.teleports else backend.joint_velocity
     # A servo's motor has the speed gain · (target - q), so it is at its limit, for the whole period, at this distance.
-    lag = 1.0 / gain if (gain := getattr(backend, "servo_gain", None)) else 0.0
+    lag = 1.0 / gain if (gain := backend.servo_gain) else 0.0
     limits = [float(v) if 0.0 < v < np.inf else None for v in velocity]
     joints = tuple(
         Joint(
@@ -58,9 +58,7 @@ def action_of(simulation: Any) -> Action:
     """What the actions of a simulation mean."""
     space = simulation.action_space
     low, high = (tuple(map(float, bounds)) for bounds in (space.low, space.high))
-    actions = getattr(simulation, "actions", None)
-    if actions is None:
-        return Action("absolute", low, high, (), "position")
+    actions = simulation.actions
     steps = tuple(map(float, actions.steps))
     return Action(actions.mode, low, high, steps, actions.settings.action_from)
 

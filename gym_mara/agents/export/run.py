@@ -90,10 +90,9 @@ def _about(run: RunFolder, which: str, policy: PolicyDescription, env: MaraVecto
 
 def _action(policy: PolicyDescription) -> Action:
     """What the actions of a policy mean."""
-    low, high, action = tuple(policy.low), tuple(policy.high), getattr(policy, "action", None)
-    if action is None:
-        return Action("absolute", low, high, (), "position")
-    return Action(action.mode, low, high, tuple(action.steps), action.reference)
+    action = policy.action
+    low, high, steps = tuple(policy.low), tuple(policy.high), tuple(action.steps)
+    return Action(action.mode, low, high, steps, action.reference)
 
 
 def _without_folders(value: Any) -> Any:
