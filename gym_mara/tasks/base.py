@@ -48,6 +48,8 @@ class Task(ABC):
 
     random_goal: ClassVar[bool] = False
     """Whether `draw_goal` draws a new goal for each episode."""
+    preset_family: ClassVar[str] = ""
+    """The family of tasks for which an algorithm may have presets of its own; see docs/add_an_algorithm.md."""
 
     on_collision: str = "reset"
     """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or

@@ -6,6 +6,7 @@ import math
 import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 
 from gym_mara.errors import GymMaraError, short, unknown
@@ -49,7 +50,8 @@ class Preset:
     """Keyword arguments of the algorithm's class, as plain values.
 
     A value that changes during the run is a tuple of points (progress, value), connected by straight lines; the progress
-    goes from 0 to 1. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`.
+    goes from 0 to 1. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`, and `activation_fn`
+    is one of ACTIVATIONS.
     """
     normalise_observation: bool = False
     normalise_reward: bool = False
@@ -83,6 +85,8 @@ _LARGEST_ROLLOUT = 2**22
 _LARGEST_WHOLE = 10**12
 _NETWORK = (6, 1024)
 """The most layers of a network, and the most units of a layer."""
+ACTIVATIONS = ("ReLU", "Tanh", "ELU", "SiLU", "GELU", "LeakyReLU")
+"""The activation functions of a network, each a class in `torch.nn`."""
 _POLICY_NUMBERS = ("log_std_init", "ortho_init", "covariance_rate", "bias_rate", "widening")
 
 
@@ -104,13 +108,16 @@ def _check_policy(values: Any) -> None:
                     f"net_arch must be a list of at most {layers} sizes from 1 to {units}, or such lists "
                     f"by the names 'pi' and 'vf', not {short(value)}"
                 )
+        elif name == "activation_fn":
+            if value not in ACTIVATIONS:
+                raise unknown("activation function", value, ACTIVATIONS)
         elif name == "optimizer_class":
             if not isinstance(value, str) or not value.isidentifier():
                 raise GymMaraError(
                     f"optimizer_class must be the name of an optimiser, not {short(value)}"
                 )
         elif name not in _POLICY_NUMBERS:
-            valid = ["net_arch", "optimizer_class", *_POLICY_NUMBERS]
+            valid = ["net_arch", "activation_fn", "optimizer_class", *_POLICY_NUMBERS]
             raise unknown("argument of the policy", name, valid)
         elif not _is_number(value):
             raise GymMaraError(f"{name} must be a finite number, not {short(value)}")
@@ -152,13 +159,19 @@ def is_schedule(value: Any) -> TypeGuard[Sequence[Sequence[float]]]:
     return isinstance(value, (tuple, list)) and bool(value) and isinstance(value[0], (tuple, list))
 
 
-class PresetPair(NamedTuple):
-    """The presets of one name for the two ways in which a backend moves the joints."""
+class Presets(NamedTuple):
+    """The presets of one name, for the ways in which a backend moves the joints and for families of tasks."""
 
     teleporting: Preset
     """For joints that are at their targets after one step."""
     travelling: Preset
     """For joints that need several steps to reach their targets."""
+    families: Mapping[str, Preset] = MappingProxyType({})
+    """`Task.preset_family` → the preset for these tasks on every backend; the two above are for all other tasks."""
+
+    def choose(self, *, teleports: bool, family: str = "") -> Preset:
+        """The preset for a backend whose joints teleport, or travel, and a family of tasks."""
+        return self.families.get(family) or (self.teleporting if teleports else self.travelling)
 
 
 class LogRange(NamedTuple):
@@ -192,7 +205,7 @@ class Algorithm:
     """What it is, in a few words, for `gym-mara list`."""
     target: str
     """The class as "module:Class", imported when first used."""
-    presets: Mapping[str, PresetPair]
+    presets: Mapping[str, Presets]
     """Name → presets; "tuned" is the default and must be among them."""
     search_space: SearchSpace
 
@@ -200,7 +213,7 @@ class Algorithm:
         """The algorithm's class, its module imported."""
         return pkgutil.resolve_name(self.target)
 
-    def preset_pair(self, name: str) -> PresetPair:
+    def presets_of(self, name: str) -> Presets:
         """The presets of this name.
 
         Raises:
@@ -210,11 +223,10 @@ class Algorithm:
             raise unknown("preset", name, self.presets, f" of the algorithm {self.name!r}")
         return self.presets[name]
 
-    def preset(self, name: str, *, teleports: bool) -> Preset:
-        """The preset of this name for a backend whose joints teleport, or travel.
+    def preset(self, name: str, *, teleports: bool, family: str = "") -> Preset:
+        """The preset of this name for a backend whose joints teleport, or travel, and a family of tasks.
 
         Raises:
             GymMaraError: the algorithm has no such preset.
         """
-        pair = self.preset_pair(name)
-        return pair.teleporting if teleports else pair.travelling
+        return self.presets_of(name).choose(teleports=teleports, family=family)

@@ -170,6 +170,8 @@ def policy_arguments(preset: Preset, observation: Space[Any]) -> dict[str, Any]:
         if not (isinstance(optimizer, type) and issubclass(optimizer, torch.optim.Optimizer)):
             raise GymMaraError(f"torch.optim has no optimiser {name!r}")
         arguments["optimizer_class"] = optimizer
+    if (name := arguments.get("activation_fn")) is not None:
+        arguments["activation_fn"] = getattr(torch.nn, name)
     if isinstance(observation, Dict):
         arguments["features_extractor_class"] = CombinedExtractor
     return arguments

@@ -63,18 +63,20 @@ def train(
 
 
 def preset_of(config: RunConfig) -> Preset:
-    """The preset that a configuration names, for joints that teleport or travel as they do in its environment.
+    """The preset that a configuration names, for the task and the backend of its environment.
 
     Raises:
         GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
     """
-    pair = algorithm(config.algo).preset_pair(config.preset_name)
+    presets = algorithm(config.algo).presets_of(config.preset_name)
     env = make_env(config.env, config.backend, 1, config.env_options)
     try:
-        teleports = env.env.simulation.backend.teleports
+        simulation = env.env.simulation
+        return presets.choose(
+            teleports=simulation.backend.teleports, family=simulation.task.preset_family
+        )
     finally:
         env.close()
-    return pair.teleporting if teleports else pair.travelling
 
 
 def resume(path: Path, on_progress: OnProgress) -> RunFolder:

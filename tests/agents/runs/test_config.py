@@ -105,6 +105,8 @@ def changed(run: RunFolder, path: Path, **changes: Any) -> RunConfig:
         {"preset__arguments__policy_kwargs__net_arch": 64},
         {"preset__arguments__policy_kwargs__log_std_init": "x"},
         {"preset__arguments__policy_kwargs__optimizer_class": "os.system"},
+        {"preset__arguments__policy_kwargs__activation_fn": "Linear"},
+        {"preset__arguments__policy_kwargs__activation_fn": ["ReLU"]},
         {"preset__arguments__policy_kwargs__features_extractor_class": "x"},
     ],
 )
