@@ -194,7 +194,7 @@ def test_an_option_of_rewards_without_effect_is_an_error(
     ("arguments", "message"),
     [
         (["train", "--env", "MARA-v1"], "Did you mean 'MARA-v0'"),
-        (["train", "--algo", "sac"], "unknown algorithm 'sac'"),
+        (["train", "--algo", "a3c"], "unknown algorithm 'a3c'"),
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
         (["train", "--steps", "nan"], "'--steps': must be a whole number"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pkgutil
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -12,17 +13,22 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 from gym_mara.errors import GymMaraError, short, unknown
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from gym_mara.agents.algorithms.unit_policy import MarksUnitActions
 
 POLICY_FORMS = {
     "mlp": "gym_mara.agents.algorithms.unit_policy:MlpPolicy",
     "natural": "gym_mara.agents.algorithms.natural_gaussian:NaturalGaussianPolicy",
+    "sac": "gym_mara.agents.algorithms.squashed_policy:SquashedPolicy",
+    "tqc": "gym_mara.agents.algorithms.squashed_policy:SquashedQuantilePolicy",
 }
 """The policy networks by name, each as "module:Class", imported when first used."""
+_WITH_Q = ("sac", "tqc")
+"""The networks whose critics are functions of state and action."""
 
 
-def policy_class(form: str) -> type[ActorCriticPolicy]:
+def policy_class(form: str) -> type[MarksUnitActions]:
     """The class of the policy network of this name.
 
     Raises:
@@ -50,7 +56,7 @@ class Preset:
     """Keyword arguments of the algorithm's class, as plain values.
 
     A value that changes during the run is a tuple of points (progress, value), connected by straight lines; the progress
-    goes from 0 to 1. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`, and `activation_fn`
+    goes from 0 to 1. `ent_coef` of SAC and TQC may be "auto" or "auto_" with its first value. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`, and `activation_fn`
     is one of ACTIVATIONS.
     """
     normalise_observation: bool = False
@@ -67,8 +73,15 @@ class Preset:
                 f"a preset has 1 to {_MOST_ARMS} arms, and at most {_LARGEST_ROLLOUT} steps in a rollout, "
                 f"not {short(self.num_envs)} arms with {short(steps)} steps each"
             )
+        size = self.arguments.get("buffer_size", 1)
+        if type(size) is not int or not 1 <= size <= _LARGEST_BUFFER:
+            raise GymMaraError(
+                f"buffer_size must be a whole number from 1 to {_LARGEST_BUFFER:,}, not {short(size)}"
+            )
         policy = self.arguments.get("policy_kwargs", {})
         others = {name: v for name, v in self.arguments.items() if name != "policy_kwargs"}
+        if isinstance(start := others.get("ent_coef"), str) and _LEARNT.fullmatch(start):
+            del others["ent_coef"]
         for name, value in others.items():
             points = value if is_schedule(value) else [(0.0, value)]
             if any(len(point) != 2 for point in points) or not all(
@@ -77,28 +90,33 @@ class Preset:
                 raise GymMaraError(
                     f"the argument {name!r} must be a number or points (progress, value), not {short(value)}"
                 )
-        _check_policy(policy)
+        _check_policy(policy, "qf" if self.policy in _WITH_Q else "vf")
 
 
 _MOST_ARMS = 2**16
 _LARGEST_ROLLOUT = 2**22
+_LARGEST_BUFFER = 2**21
+_LEARNT = re.compile(r"auto(_(0\.[0-9]*[1-9]|[1-9][0-9]*(\.[0-9]+)?))?")
+"""An entropy coefficient that is learnt, with or without its first value."""
 _LARGEST_WHOLE = 10**12
 _NETWORK = (6, 1024)
 """The most layers of a network, and the most units of a layer."""
 ACTIVATIONS = ("ReLU", "Tanh", "ELU", "SiLU", "GELU", "LeakyReLU")
 """The activation functions of a network, each a class in `torch.nn`."""
 _POLICY_NUMBERS = ("log_std_init", "ortho_init", "covariance_rate", "bias_rate", "widening")
+_POLICY_COUNTS = {"n_critics": 8, "n_quantiles": 128}
+"""The whole numbers among the arguments of a network, each with its largest value."""
 
 
-def _check_policy(values: Any) -> None:
-    """Raises GymMaraError if the arguments of a policy network are not valid."""
+def _check_policy(values: Any, critic: str) -> None:
+    """Raises GymMaraError if the arguments of a policy network are not valid; `critic` is the name of its critic."""
     if not isinstance(values, dict):
         raise GymMaraError(f"policy_kwargs must be a dict, not {short(values)}")
     layers, units = _NETWORK
     for name, value in values.items():
         if name == "net_arch":
             nets = list(value.values()) if isinstance(value, dict) else [value]
-            if (isinstance(value, dict) and set(value) - {"pi", "vf"}) or not all(
+            if (isinstance(value, dict) and set(value) - {"pi", critic}) or not all(
                 isinstance(net, (list, tuple))
                 and len(net) <= layers
                 and all(type(size) is int and 1 <= size <= units for size in net)
@@ -106,7 +124,7 @@ def _check_policy(values: Any) -> None:
             ):
                 raise GymMaraError(
                     f"net_arch must be a list of at most {layers} sizes from 1 to {units}, or such lists "
-                    f"by the names 'pi' and 'vf', not {short(value)}"
+                    f"by the names 'pi' and {critic!r}, not {short(value)}"
                 )
         elif name == "activation_fn":
             if value not in ACTIVATIONS:
@@ -116,8 +134,19 @@ def _check_policy(values: Any) -> None:
                 raise GymMaraError(
                     f"optimizer_class must be the name of an optimiser, not {short(value)}"
                 )
+        elif name in _POLICY_COUNTS:
+            if type(value) is not int or not 1 <= value <= _POLICY_COUNTS[name]:
+                raise GymMaraError(
+                    f"{name} must be a whole number from 1 to {_POLICY_COUNTS[name]}, not {short(value)}"
+                )
         elif name not in _POLICY_NUMBERS:
-            valid = ["net_arch", "activation_fn", "optimizer_class", *_POLICY_NUMBERS]
+            valid = [
+                "net_arch",
+                "activation_fn",
+                "optimizer_class",
+                *_POLICY_COUNTS,
+                *_POLICY_NUMBERS,
+            ]
             raise unknown("argument of the policy", name, valid)
         elif not _is_number(value):
             raise GymMaraError(f"{name} must be a finite number, not {short(value)}")
@@ -197,7 +226,7 @@ class SearchSpace:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An on-policy algorithm in the form of Stable-Baselines3."""
+    """An on-policy or off-policy algorithm in the form of Stable-Baselines3."""
 
     name: str
     """Its name in `--algo`; figures and tables print it in capitals."""
@@ -209,7 +238,7 @@ class Algorithm:
     """Name → presets; "tuned" is the default and must be among them."""
     search_space: SearchSpace
 
-    def load_class(self) -> type[OnPolicyAlgorithm]:
+    def load_class(self) -> type[BaseAlgorithm]:
         """The algorithm's class, its module imported."""
         return pkgutil.resolve_name(self.target)
 

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from gym_mara.agents.runs.evaluation import episodes_to_judge, make_env, play
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import base_env, normalisation, save_policy
 from gym_mara.agents.sb3 import MaraVecEnv
-from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, encoded_state
+from gym_mara.agents.training.checkpoint import Progress, state_files
 from gym_mara.agents.training.learning_curve import plot_learning_curve
+from gym_mara.agents.training.replay import remove_replay
 
 OnProgress = Callable[[int, dict[str, float]], None]
 """Called with the number of steps so far and the values to show."""
+_ROW_EVERY = 2000
+"""The least steps between two rows of the table for an off-policy algorithm, whose rollouts may be a single step."""
 
 
 class CheckpointCallback(BaseCallback):
@@ -40,9 +43,12 @@ class CheckpointCallback(BaseCallback):
         self.on_progress = on_progress
         self.shown: dict[str, float] = {}
         self._next = 0
+        self._recorded = 0
+        """The steps up to which rewards are recorded."""
         self._eval_env: MaraVecEnv | None = None
 
     def _on_training_start(self) -> None:
+        self._recorded = self.num_timesteps
         self._next = self.num_timesteps + self.run.config.checkpoint_every
         config = self.run.config
         episodes = episodes_to_judge(config)
@@ -58,19 +64,27 @@ class CheckpointCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        model = self.model
-        env = base_env(model)
-        steps = self.model.n_steps * env.num_envs  # type: ignore[attr-defined]
-        self.shown["reward_per_step"] = env.reward_sum / steps
-        env.reward_sum = 0.0
-        self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
+        least = _ROW_EVERY if isinstance(self.model, OffPolicyAlgorithm) else 0
+        if self.model.num_timesteps - self._recorded >= least:
+            self._record_reward()
+            self.model.dump_logs()
         self.on_progress(self.model.num_timesteps, self.shown)
+
+    def _record_reward(self) -> None:
+        """Record the mean reward of the steps since the last record, if there are any."""
+        env = base_env(self.model)
+        steps = self.model.num_timesteps - self._recorded
+        if steps:
+            self.shown["reward_per_step"] = env.reward_sum / steps
+            self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
+        self._recorded, env.reward_sum = self.model.num_timesteps, 0.0
 
     def _on_training_end(self) -> None:
         self.checkpoint()
         plot_learning_curve(self.run)
-        # This marks the run as finished, so it comes last.
-        save_policy(self.run.path / "last", self.model)  # type: ignore[arg-type]
+        # This marks the run as finished. A finished run needs no replay buffer.
+        save_policy(self.run.path / "last", self.model)
+        remove_replay(self.run.checkpoints())
 
     def close(self) -> None:
         """Close the environment of the evaluations."""
@@ -79,8 +93,9 @@ class CheckpointCallback(BaseCallback):
 
     def checkpoint(self) -> None:
         """Evaluate, save the policy if it is the best so far, and write a checkpoint."""
-        model: Any = self.model
+        model = self.model
         steps = model.num_timesteps
+        self._record_reward()
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[f"eval_{name}"] = value
@@ -92,11 +107,12 @@ class CheckpointCallback(BaseCallback):
         if self.shown["eval_reward_per_step"] > self.best:
             self.best = self.shown["eval_reward_per_step"]
             save_policy(self.run.path / "best", model)
-        state = encoded_state(model, Progress(self.best, elapsed))
-        save_policy(self.run.path / "checkpoints" / str(steps), model, {STATE_FILE: state})
+        files = state_files(model, Progress(self.best, elapsed))
+        save_policy(self.run.path / "checkpoints" / str(steps), model, files)
+        remove_replay(self.run.checkpoints()[:-1])
 
     def _evaluate(self) -> dict[str, float]:
-        trained = normalisation(self.model)  # type: ignore[arg-type]
+        trained = normalisation(self.model)
         assert self._eval_env is not None
         env = VecNormalize(
             self._eval_env,

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Dict
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
     Logger,
     TensorBoardOutputFormat,
 )
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
@@ -34,6 +36,7 @@ from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, r
 from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
+from gym_mara.agents.training.replay import hindsight
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from gym_mara.files import DamagedFileError, locked, refuse_links
@@ -121,7 +124,7 @@ def _locked(run: RunFolder) -> AbstractContextManager[None]:
     return locked(run.path / ".lock", busy)
 
 
-def new_model(config: RunConfig) -> OnPolicyAlgorithm:
+def new_model(config: RunConfig) -> BaseAlgorithm:
     """An untrained agent and its environment, from a configuration."""
     preset = config.made_preset()
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
@@ -140,7 +143,7 @@ def preset_agent(
     backend: str = DEFAULT_BACKEND,
     seed: int = 0,
     **options: Any,
-) -> OnPolicyAlgorithm:
+) -> BaseAlgorithm:
     """An untrained agent with the hyperparameters of a preset and its environment, for a script of your own.
 
     Args:
@@ -169,12 +172,18 @@ def preset_agent(
     return new_model(replace(config, preset=asdict(preset_of(config))))
 
 
-def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
+def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> BaseAlgorithm:
     """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3.
 
+    An off-policy algorithm gets hindsight replay where `hindsight` says so.
+
     Raises:
-        GymMaraError: the algorithm does not take an argument of the preset.
+        GymMaraError: the algorithm does not take an argument of the preset, or the preset normalises dictionaries.
     """
+    if preset.normalise_observation and isinstance(env.observation_space, Dict):
+        raise GymMaraError(
+            "a preset with normalise_observation needs observations that are arrays, not dictionaries"
+        )
     use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
@@ -183,6 +192,8 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
     arguments["policy_kwargs"] = policy_arguments(preset, env.observation_space)
     policy = policy_class(preset.policy)
     make = algorithm(algo).load_class()
+    if issubclass(make, OffPolicyAlgorithm):
+        arguments |= hindsight(env, preset)
     try:
         return make(policy, wrapped, seed=seed, device="cpu", **arguments)
     except (TypeError, ValueError, AssertionError) as error:
@@ -232,7 +243,7 @@ _UNWRITABLE = {
 
 def _learn(
     run: RunFolder,
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     on_progress: OnProgress,
     reached: Progress = _NOTHING,
 ) -> RunFolder:
@@ -242,7 +253,8 @@ def _learn(
         try:
             on_progress(model.num_timesteps, {})
             left = run.config.steps - model.num_timesteps
-            model.learn(left, callback=callback, reset_num_timesteps=False)
+            # No interval: the callback writes the rows.
+            model.learn(left, callback, log_interval=None, reset_num_timesteps=False)  # type: ignore[arg-type]
         finally:
             model.logger.close()
     except OSError as error:
@@ -267,11 +279,11 @@ def _learn(
     return run
 
 
-def _is_finite(model: OnPolicyAlgorithm) -> bool:
+def _is_finite(model: BaseAlgorithm) -> bool:
     """Whether a model's parameters, its standard deviations and their inverses are finite."""
     numbers: list[torch.Tensor] = list(model.policy.parameters())
-    if hasattr(model.policy, "log_std"):
-        numbers += [model.policy.log_std.exp(), (-model.policy.log_std).exp()]
+    if isinstance(log_std := getattr(model.policy, "log_std", None), torch.Tensor):
+        numbers += [log_std.exp(), (-log_std).exp()]
     return all(bool(each.isfinite().all()) for each in numbers)
 
 

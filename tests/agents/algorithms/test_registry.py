@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from stable_baselines3 import A2C
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
@@ -77,7 +78,7 @@ def test_an_entry_is_complete(name: str) -> None:
     assert entry.name == name
     assert entry.summary
     assert DEFAULT_PRESET in entry.presets
-    assert issubclass(entry.load_class(), OnPolicyAlgorithm)
+    assert issubclass(entry.load_class(), (OnPolicyAlgorithm, OffPolicyAlgorithm))
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
