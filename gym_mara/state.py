@@ -48,6 +48,11 @@ class SimState:
     None if the state cannot diverge."""
     parameters: Mapping[str, Floats] | None = None
     """The random parameters of each arm's episode by name, each (N, …); None without randomisation."""
+    action: Floats | None = None
+    """The last action of each arm (N, A), in the units of the action space, zero at the start of an episode. The simulation
+    fills this field and the next one; a backend leaves both None."""
+    last_action: Floats | None = None
+    """The action before it (N, A)."""
 
     def __init__(
         self,
@@ -62,6 +67,8 @@ class SimState:
         contacts: tuple[tuple[Contact, ...], ...] | None = None,
         diverged: Mask | None = None,
         parameters: Mapping[str, Floats] | None = None,
+        action: Floats | None = None,
+        last_action: Floats | None = None,
     ) -> None:
         # The constructor that a frozen dataclass generates takes almost twice as long, and every step makes a state.
         vars(self).update(
@@ -76,6 +83,8 @@ class SimState:
             contacts=contacts,
             diverged=diverged,
             parameters=parameters,
+            action=action,
+            last_action=last_action,
         )
 
     def with_q(self, q: Floats) -> SimState:
@@ -83,3 +92,9 @@ class SimState:
         state = object.__new__(SimState)
         vars(state).update(vars(self), q=q)
         return state
+
+    def fill_actions(self, action: Floats, last_action: Floats) -> None:
+        """Set the last action of each arm and the one before it, each (N, A), in a state that nobody else has yet."""
+        vars(self).update(
+            action=action, last_action=last_action
+        )  # a copy would take four times as long

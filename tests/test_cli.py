@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +16,9 @@ import typer
 from rich.console import Console
 
 from gym_mara.agents.algorithms.registry import ALGORITHMS
+from gym_mara.agents.evaluation.metrics import METRICS
 from gym_mara.agents.experiments.grid import Grid
-from gym_mara.cli import experiments
+from gym_mara.cli import common, experiments
 from gym_mara.cli.app import app
 from gym_mara.cli.common import whole
 from gym_mara.errors import GymMaraError
@@ -81,21 +83,16 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     assert rows[3]["settings"] == {"max_joint_velocity": 1.57}
     assert rows[1]["highest_torque"]["mean"] > 0.0
     assert rows[2]["highest_torque"] is None
-    assert rows[0]["position_error_mm"].keys() == {"mean", "std", "min", "max"}
+    statistics = {"mean", "std", "min", "max", "p50", "p95"}
+    assert rows[0]["position_error_mm"].keys() == statistics
     code, out, _ = gym_mara("evaluate", run, "--episodes", "2", "--json", "--policy", "best")
     assert code == 0
-    metrics = json.loads(out)
-    assert list(metrics) == [
-        "position_error_mm",
-        "angle_deg",
-        "reward_per_step",
-        "return",
-        "collisions",
-    ]
-    assert all(values.keys() == {"mean", "std", "min", "max"} for values in metrics.values())
+    metrics = json.loads(out, parse_constant=pytest.fail)
+    assert metrics["position_error_mm"].keys() == statistics
+    assert metrics["success_percent"] is None
     code, out, _ = gym_mara("evaluate", run, "--backend", "pinocchio")
     assert code == 0
-    assert "10 episode(s)" in out
+    assert "10 episodes" in out
     away = ("--set", "target_position=[0.1, 0.3, 0.9]")
     _, moved, _ = gym_mara("evaluate", run, *away)
     assert moved != out
@@ -104,6 +101,55 @@ def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
     code, _, err = gym_mara("train", "--out", run)
     assert code == 2
     assert "not overwritten" in err
+
+
+BASELINE = ("evaluate", "--baseline", "ik", "--env", "MARAGoal-v0")
+
+
+def test_a_baseline_is_measured_like_a_policy(gym_mara: Cli) -> None:
+    code, out, _ = gym_mara(*BASELINE, "--episodes", "3", "--json")
+    assert code == 0
+    metrics = json.loads(out, parse_constant=pytest.fail)
+    assert list(metrics) == [*METRICS]
+    assert metrics["success_percent"].keys() == {"mean", "std", "min", "max", "p50", "p95"}
+    assert metrics["highest_torque"] is None, "this backend has no motors"
+    again, other = (gym_mara(*BASELINE, "--episodes", "3", "--json", "--seed", s) for s in "01")
+    assert again[1] == out
+    assert other[1] != out
+
+
+def test_a_table_of_metrics_has_at_most_80_columns(
+    gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(common.out, "width", 80)
+    for name in ("MARAGoal-v0", "MARA-v0"):
+        code, out, _ = gym_mara("evaluate", "--baseline", "ik", "--env", name, "--episodes", "3")
+        assert code == 0
+        assert "baseline ik, seed 0, 3 episodes" in out
+        assert all(title.strip() in out for title in METRICS.values()), "no title is wrapped"
+        assert "…" not in out
+    assert re.search(r"episodes with a collision +0\.0 % *\n", out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate"], "give a run folder, or --baseline ik"),
+        ([*BASELINE, "run"], "--baseline plays no run: leave out run"),
+        ([*BASELINE, "--policy", "best"], "--baseline plays no run: leave out --policy"),
+        (["evaluate", "run", "--env", "MARA-v0"], "has its own environment: leave out --env"),
+        (["evaluate", "--baseline", "ki"], "unknown baseline 'ki'. Valid: ik"),
+        ([*BASELINE, "--episodes", "0"], "whole number from 1 to 100,000"),
+        ([*BASELINE, "--seed", "-1"], "whole number from 0 to"),
+        ([*BASELINE, "--set", "colour=1"], "unknown keyword argument 'colour'"),
+    ],
+)
+def test_wrong_arguments_of_an_evaluation_are_errors(
+    gym_mara: Cli, arguments: list[str], message: str
+) -> None:
+    code, _, err = gym_mara(*arguments)
+    assert code == 2
+    assert message in err
 
 
 def test_the_steps_that_were_trained_are_printed_if_they_are_more(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,8 @@ import pytest
 import trimesh
 
 from gym_mara import regression
-from gym_mara.agents.inspection import transfer as transfer_module
-from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.transfer import transfer
-from gym_mara.agents.runs.evaluation import evaluate_run, options_on
+from gym_mara.agents.runs.evaluation import Player, evaluate_run, options_on
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.envs import MaraEnv
@@ -23,7 +20,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.options import ROBOT_KEYWORDS
-from tests.agents.conftest import ROLLOUT, config, silent
+from tests.agents.conftest import ROLLOUT, config, shorten_episodes, silent
 from tests.helpers import joint_xml, urdf_xml, write
 
 
@@ -173,9 +170,9 @@ def test_another_robot_keeps_the_options_of_the_run_unless_they_are_replaced(
 def test_a_transfer_has_them_on_every_backend(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer_module, "roll_out", partial(roll_out, steps=2))
+    shorten_episodes(monkeypatch, 2)
     backends = ["dart", "mujoco", "pinocchio"]
     rows = transfer(run, backends=backends, options={"velocity_limit": 0.5})
     assert [row.backend for row in rows] == [*backends, "pinocchio"]
     assert rows[-1].settings == {"max_joint_velocity": 0.5}
-    assert np.nanmax([row.highest_velocity for row in rows]) <= 0.5 + 1e-9
+    assert np.nanmax([row.metrics["highest_velocity"] for row in rows]) <= 0.5 + 1e-9

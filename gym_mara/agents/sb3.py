@@ -39,14 +39,14 @@ def require_numpy(env: MaraVectorEnv) -> None:
 
 
 class MaraVecEnv(VecEnv):
-    """N arms for Stable-Baselines3. Actions are joint targets, rad, or are scaled to them as `RescaleAction` does.
+    """N arms for Stable-Baselines3. Actions are those of the environment, or are scaled to them as `RescaleAction` does.
 
     The info of an arm is empty except at the end of its episode. There it holds `terminal_observation`,
     `TimeLimit.truncated`, the `episode` of a Monitor, and the info of MaraEnv at the last step.
 
     Args:
         env: the environment, with the autoreset mode SAME_STEP.
-        action_space: the space of the actions (J,), such as `Box(-1, 1, (6,))`, whose bounds are scaled to those of the
+        action_space: the space of the actions (A,), such as `Box(-1, 1, (6,))`, whose bounds are scaled to those of the
             environment; by default the space of the environment, which is not scaled.
 
     Raises:
@@ -86,7 +86,7 @@ class MaraVecEnv(VecEnv):
         self._actions = actions
 
     def targets(self, actions: ArrayLike) -> ArrayLike:
-        """The joint targets (N, J), rad, of actions (N, J).
+        """The actions of the environment (N, A) for actions (N, A) in `action_space`.
 
         Raises:
             GymMaraError: a policy's actions in [-1, 1] are not in the action space of this environment.

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.errors import GymMaraError, positive_number
+from gym_mara.errors import LARGEST, GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.types import Array, Floats, Mask
@@ -41,6 +41,9 @@ class Backend(ABC):
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float
     """How long one step lasts, s."""
+    servo_gain: float | None = None
+    """The gain of position servos, q̇ = clip(gain (target - q), ±joint_velocity), 1/s; None where joints reach targets that are
+    within joint_velocity times control_period."""
     arrays: str = "numpy"
     """The library of the arrays that `reset` and `step` take, and of those in the states: "numpy", or "torch" for tensors.
 
@@ -121,17 +124,19 @@ class Backend(ABC):
         """Free the engine; no other method is called afterwards."""
 
 
-def limited_velocity(robot: RobotModel, max_joint_velocity: float) -> Floats:
-    """The highest velocity of each joint (J,), rad/s (m/s): `max_joint_velocity`, or the robot's limit where that is lower.
+def limited_velocity(robot: RobotModel, max_joint_velocity: float | None) -> Floats:
+    """The highest velocity of each joint (J,), rad/s (m/s): the robot's limit, or `max_joint_velocity` where that is lower.
 
     Raises:
         GymMaraError: it is no positive number, or the robot's limit of a joint is zero.
     """
-    limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
+    limit = LARGEST
+    if max_joint_velocity is not None:
+        limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
     if not (robot.velocity_limit > 0.0).all():
         joint = robot.joint_names[int((robot.velocity_limit > 0.0).argmin())]
         raise GymMaraError(
-            f"joint {joint} of {robot.name} cannot move with max_joint_velocity, because its velocity limit is 0: correct the "
+            f"joint {joint} of {robot.name} cannot move at a limited velocity, because its velocity limit is 0: correct the "
             f"URDF, or give velocity_limit={{{joint!r}: …}}, rad/s (m/s)"
         )
     return np.minimum(limit, robot.velocity_limit)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gym_mara.backends.base import Backend, limited_velocity
+from gym_mara.backends.servo_motion import servo_motion
 from gym_mara.collision import make_checker
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.cached import CachedChecker
@@ -30,14 +31,16 @@ class PinocchioBackend(Backend):
 
     By default the joints reach their targets within a step and rest there (gym-gazebo2's training mode). With
     `max_joint_velocity` each joint moves at this velocity, or at the URDF's limit where that is lower, until it arrives (its run
-    mode), and the arm stops where its path first collides.
+    mode), and the arm stops where its path first collides. With `servo_gain` each joint follows the law of the dynamic
+    backends' position servos, without their mass (`gym_mara.backends.servo_motion`), along a path checked in the same way.
 
     Args:
         robot: the arm.
         num_envs: the number of arms.
         control_period: s.
-        max_joint_velocity: rad/s (m/s for a prismatic joint), where it is below the URDF's limits; None for joints that
-            teleport.
+        max_joint_velocity: rad/s (m/s for a prismatic joint), where it is below the URDF's limits; None for those, or
+            without `servo_gain` for joints that teleport.
+        servo_gain: 1/s; None for joints without the law of a servo.
         collision: the collision engine: "coal" (the faster), "fcl", or "none" for no collisions.
         collision_threads: how many threads Coal uses; worth it for large batches on idle cores.
         path_resolution: the longest way of any point of the arm between two checks along a path, m.
@@ -54,13 +57,16 @@ class PinocchioBackend(Backend):
         *,
         control_period: float = 0.02,
         max_joint_velocity: float | None = None,
+        servo_gain: float | None = None,
         collision: str = "coal",
         collision_threads: int = 1,
         path_resolution: float = 0.005,
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        self.teleports = max_joint_velocity is None
-        if max_joint_velocity is not None:
+        self.teleports = max_joint_velocity is None and servo_gain is None
+        if servo_gain is not None:
+            self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
+        if not self.teleports:
             self.joint_velocity = limited_velocity(robot, max_joint_velocity)
         else:  # the velocities are 0, but without a limit their bounds would be huge
             limit = robot.velocity_limit
@@ -109,23 +115,28 @@ class PinocchioBackend(Backend):
     def _travel(self, q_target: Floats) -> None:
         """Move along the path of one period, up to the first collision on it."""
         way, furthest = q_target - self._q, self._furthest
-        length = (np.minimum(np.abs(way), furthest) * self.robot.reach).sum(1)
+        # Joints are fastest at the beginning: a servo's joint at gain times its way, or at the limit.
+        initial = 1.0 if self.servo_gain is None else self.servo_gain * self.control_period
+        length = (np.minimum(initial * np.abs(way), furthest) * self.robot.reach).sum(1)
         samples = np.maximum(1, np.ceil(length / self.path_resolution)).astype(np.int64)
         free = np.zeros(self.num_envs, np.bool_)
         if self._with_margin is not None:
             # A path is free where the arm, at the middle of it, is far enough from everything.
             long = samples > 1
-            middle = self._q[long] + 0.5 * np.clip(way[long], -furthest, furthest)
+            middle = self._q[long] + 0.5 * self._moved(way[long], np.array(1.0))
             free[long] = ~self._with_margin.check(middle)
             samples[free] = 1
         # The samples of all paths in one array, arm after arm: the arm, and the number of the sample on its path.
         arm = np.repeat(np.arange(self.num_envs), samples)
         last = np.cumsum(samples) - 1
         sample = np.arange(1, len(arm) + 1) - (last - samples + 1)[arm]
-        limit = furthest * (sample / samples[arm])[:, None]
-        path = self._q[arm] + np.clip(way[arm], -limit, limit)
-        arrived = np.abs(way[arm]) <= limit * (1.0 + 1e-9)
-        path[arrived] = q_target[arm][arrived]  # exactly, without rounding
+        part = (sample / samples[arm])[:, None]
+        path = self._q[arm] + self._moved(way[arm], part)
+        if self.servo_gain is None:
+            arrived = np.abs(way[arm]) <= furthest * part * (1.0 + 1e-9)
+            path[arrived] = q_target[arm][arrived]  # exactly, without rounding
+        else:
+            path = np.minimum(np.maximum(path, self.robot.lower), self.robot.upper)
         hit, unsure = np.zeros(len(arm), np.bool_), ~free[arm]
         hit[unsure] = self._checker.check(path[unsure])
         first_hit = np.minimum.reduceat(
@@ -136,8 +147,24 @@ class PinocchioBackend(Backend):
         collided = first_hit <= last
         self._q = path[stop]
         resting = (self._q == q_target) | (collided & ~self._touching)[:, None]
-        self._qd = np.where(resting, 0.0, np.sign(way) * self.joint_velocity)
+        self._qd = np.where(resting, 0.0, self._velocity(way, q_target))
         self._collided, self._touching = collided, collided.copy()
+
+    def _moved(self, way: Floats, part: Floats) -> Floats:
+        """How far joints (..., J) on their way to their targets have moved after a part of a period."""
+        if self.servo_gain is None:
+            limit = self._furthest * part
+            return np.clip(way, -limit, limit)
+        time = self.control_period * part
+        gain = np.array(self.servo_gain)
+        return servo_motion(np.zeros(()), way, gain, self.joint_velocity, time)
+
+    def _velocity(self, way: Floats, q_target: Floats) -> Floats:
+        """The velocities (N, J) of joints that have been on their way for one period."""
+        if self.servo_gain is None:
+            return np.sign(way) * self.joint_velocity
+        wanted = self.servo_gain * (q_target - self._q)
+        return np.clip(wanted, -self.joint_velocity, self.joint_velocity)
 
     @property
     def state(self) -> SimState:

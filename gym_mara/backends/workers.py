@@ -95,7 +95,7 @@ class WorkerBackend(Backend):
         super().__init__(robot, num_envs, control_period=example.control_period)
         self.joint_velocity = example.joint_velocity
         self.random, self.teleports = example.random, example.teleports
-        self.overshoot = example.overshoot
+        self.overshoot, self.servo_gain = example.overshoot, example.servo_gain
         example.close()
         size = num_envs // workers
         self._rows = [slice(start, start + size) for start in range(0, num_envs, size)]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-import numpy as np
 import typer
+from rich import box
 from rich.table import Column, Table
 
 from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
@@ -31,6 +31,7 @@ from gym_mara.cli.common import (
     keyword_arguments,
     names_in,
     needs_agents,
+    one_of,
     out,
     refuse,
     several,
@@ -40,27 +41,29 @@ from gym_mara.errors import GymMaraError
 from gym_mara.registration import file_name
 from gym_mara.types import Floats
 
-if TYPE_CHECKING:
-    from gym_mara.agents.runs.folder import RunFolder
-
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
 EpisodesOption = Annotated[
     int,
     typer.Option(
-        parser=whole(1, 1000), metavar="N", help="How many episodes to play, on each backend."
+        parser=whole(1, 100_000), metavar="N", help="How many episodes to play, on each backend."
     ),
 ]
-_UNITS = {
-    "position_error_mm": "position error, mm",
-    "angle_deg": "angle, deg",
-    "reward_per_step": "reward per step",
-    "return": "return",
-    "collisions": "collisions",
-    "settling_time_s": "settling time, s",
-    "highest_torque": "highest torque / limit",
-    "highest_velocity": "highest speed, rad/s",
-}
+SeedOption = Annotated[
+    int,
+    typer.Option(
+        parser=whole(0, 2**32 - 1),
+        metavar="N",
+        help="Seed of the episodes. None has episodes in common with a training or with the choice of its best policy.",
+    ),
+]
+
+
+def _baselines() -> Iterable[str]:
+    """The names of the baselines."""
+    with needs_agents():
+        from gym_mara.agents.evaluation.baselines import BASELINES
+    return BASELINES
 
 
 def train(
@@ -94,7 +97,7 @@ def train(
 ) -> None:
     """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log. Needs the extra train."""
     with needs_agents():
-        from gym_mara.agents.runs.evaluation import episodes_to_judge
+        from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
         from gym_mara.agents.runs.folder import RunConfig, RunFolder
         from gym_mara.agents.training.train import resume as resume_training
         from gym_mara.agents.training.train import train as start_training
@@ -124,37 +127,65 @@ def train(
         )
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress)
-    _print_evaluation(run, episodes=episodes_to_judge(run.config))
+    metrics = evaluate_run(run, episodes=episodes_to_judge(run.config))
+    _print_metrics(f"{run.config.env} on {run.config.backend}, last policy", metrics)
     if (trained := run.trained_steps()) > run.config.steps:
         out.print(f"Trained {trained:,} steps: an update needs a whole rollout of all arms.")
     out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 
 def evaluate(
-    run: RunArgument,
+    context: typer.Context,
+    run: Annotated[
+        Path | None, typer.Argument(help="A run folder; leave it out with --baseline.")
+    ] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option(
+            parser=one_of("baseline", _baselines),
+            metavar="NAME",
+            help="Instead of a run: ik, inverse kinematics and a straight joint move at the joints' velocity limits.",
+        ),
+    ] = None,
+    env: EnvOption = "MARA-v0",
     backend: RunBackendOption = None,
     episodes: EpisodesOption = 10,
+    seed: SeedOption = 0,
     policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     as_json: JsonOption = False,
 ) -> None:
-    """Play a run's deterministic policy: position error and angle at the last step, reward, collisions.
+    """Measure a run's deterministic policy, or a baseline: accuracy, success, collisions, settling, tremble, reward.
 
     Needs the extra train.
     """
     with needs_agents():
-        from gym_mara.agents.runs.evaluation import evaluate_run, spread
+        from gym_mara.agents.evaluation.baselines import evaluate_baseline
+        from gym_mara.agents.evaluation.metrics import spread
+        from gym_mara.agents.runs.evaluation import evaluate_run
         from gym_mara.agents.runs.folder import RunFolder
 
     options = keyword_arguments(settings)
-    folder = RunFolder.open(run)
-    if as_json:
-        metrics = evaluate_run(
-            folder, backend=backend, episodes=episodes, which=policy, options=options
+    if baseline is not None:
+        refuse(context, "--baseline plays no run", "run", "policy")
+        backend, who = backend or DEFAULT_BACKEND, f"baseline {baseline}"
+        metrics = evaluate_baseline(
+            baseline, env, backend=backend, episodes=episodes, seed=seed, options=options
         )
+    elif run is not None:
+        refuse(context, "the run has its own environment", "env")
+        folder = RunFolder.open(run)
+        env, who = folder.config.env, f"{policy} policy"
+        backend = backend or folder.config.backend
+        metrics = evaluate_run(
+            folder, backend=backend, episodes=episodes, seed=seed, which=policy, options=options
+        )
+    else:
+        raise GymMaraError("give a run folder, or --baseline ik and --env")
+    if as_json:
         print(json.dumps(spread(metrics), indent=2))
     else:
-        _print_evaluation(folder, backend=backend, episodes=episodes, which=policy, options=options)
+        _print_metrics(f"{env} on {backend}, {who}, seed {seed}", metrics)
 
 
 def transfer(
@@ -168,19 +199,22 @@ def transfer(
         ),
     ] = [],  # noqa: B006 - Typer reads it and never changes it
     episodes: EpisodesOption = 1,
+    seed: SeedOption = 0,
     policy: PolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     as_json: JsonOption = False,
 ) -> None:
     """Play a run's policy on several backends, and compare the results. Needs the extra train."""
     with needs_agents():
+        from gym_mara.agents.evaluation.metrics import METRICS, mean_in_short, spread
         from gym_mara.agents.inspection.transfer import transfer as play_on_all
-        from gym_mara.agents.runs.evaluation import spread
         from gym_mara.agents.runs.folder import RunFolder
 
     options, names = keyword_arguments(settings), names_in("--backend", backend)
     folder = RunFolder.open(run)
-    rows = play_on_all(folder, backends=names, episodes=episodes, which=policy, options=options)
+    rows = play_on_all(
+        folder, backends=names, episodes=episodes, seed=seed, which=policy, options=options
+    )
     if as_json:
         found = [{"backend": r.backend, "settings": r.settings, **spread(r.metrics)} for r in rows]
         print(json.dumps(found, indent=2))
@@ -191,9 +225,8 @@ def transfer(
     ]
     columns = (Column(title, justify="right", overflow="fold") for title in titles)
     table = Table("", *columns, title=", ".join([folder.config.env, f"{policy} policy", *settings]))
-    for name, unit in _UNITS.items():
-        if name in rows[0].metrics:
-            table.add_row(unit, *(_mean_and_spread(row.metrics[name]) for row in rows))
+    for name, title in METRICS.items():
+        table.add_row(title, *(mean_in_short(name, row.metrics[name]) for row in rows))
     out.print(table)
 
 
@@ -244,24 +277,20 @@ def _kept(path: Path) -> str:
     return f"Interrupted. {kept} with gym-mara train --resume {shlex.quote(str(path))}"
 
 
-def _print_evaluation(run: RunFolder, **arguments: Any) -> None:
-    from gym_mara.agents.runs.evaluation import evaluate_run, spread
+def _print_metrics(title: str, metrics: dict[str, Floats]) -> None:
+    """The statistics of each metric in a table of at most 80 columns."""
+    from gym_mara.agents.evaluation.metrics import METRICS, STATISTICS, statistics_in_short
 
-    metrics = evaluate_run(run, **arguments)
-    config = run.config
-    which, backend = arguments.get("which", "last"), arguments.get("backend") or config.backend
-    title = f"{config.env} on {backend}, {which} policy, {arguments['episodes']} episode(s)"
-    table = Table("", "mean", "std", "min", "max", title=title)
-    for name, values in spread(metrics).items():
-        cells = ["-"] * 4 if values is None else [f"{value:.2f}" for value in values.values()]
-        table.add_row(_UNITS[name], *cells)
+    columns = (Column(name, justify="right", no_wrap=True) for name in STATISTICS)
+    count = len(metrics["return"])
+    table = Table(
+        "",
+        *columns,
+        title=f"{title}, {count:,} episode{'s' * (count > 1)}",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for name, label in METRICS.items():
+        table.add_row(label, *statistics_in_short(name, metrics[name]))
     out.print(table)
-
-
-def _mean_and_spread(values: Floats) -> str:
-    """Mean and standard deviation over the episodes that have a value, and how many have one if some have not."""
-    there = values[~np.isnan(values)]
-    if not len(there):
-        return "-"
-    text = f"{there.mean():.2f}" + (f" ± {there.std():.2f}" if len(there) > 1 else "")
-    return text if len(there) == len(values) else f"{text} ({len(there)} of {len(values)} episodes)"

@@ -88,7 +88,7 @@ class GazeboMaraEnv(MaraEnv):
         self._episode_size = whole_number("episode_size", episode_size)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Move towards joint targets (J,), rad, for one control period.
+        """Execute an action (A,) for one control period.
 
         Raises:
             GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.

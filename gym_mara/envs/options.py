@@ -1,4 +1,4 @@
-"""Assigns the keyword arguments of an environment to the task, the backend, the sensors and the rendering."""
+"""Assigns the keyword arguments of an environment to the task, the backend, the actions, the sensors and the rendering."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gym_mara.backends import backend_names, backend_settings
+from gym_mara.envs.actions import ActionSettings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.rendering import RenderSettings
@@ -27,6 +28,7 @@ class Options:
     """The name of the backend."""
     settings: dict[str, Any]
     """The backend's keyword arguments."""
+    actions: ActionSettings
     sensors: SensorSettings
     rendering: RenderSettings
 
@@ -47,7 +49,8 @@ class Options:
             robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
             ee_frame: the end-effector link of a URDF of your own.
             backend: the name of a backend.
-            keywords: values of the task and the robot, and settings of the backend, the sensors and the rendering.
+            keywords: values of the task and the robot, and settings of the backend, the actions, the sensors and the
+                rendering.
             receiver: the class of the environment that received them, for the names in an error.
 
         Raises:
@@ -59,6 +62,7 @@ class Options:
             "task": _names(chosen),
             "robot": _names(RobotOptions),
             "backend": backend_settings(backend),
+            "actions": _names(ActionSettings),
             "sensors": _names(SensorSettings),
             "rendering": _names(RenderSettings),
         }
@@ -78,6 +82,7 @@ class Options:
             robot=RobotModel.load(robot, ee_frame, **own["robot"]),
             backend=backend,
             settings=own["backend"],
+            actions=ActionSettings(**own["actions"]),
             sensors=SensorSettings(**own["sensors"]),
             rendering=RenderSettings(**own["rendering"]),
         )

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from gym_mara.envs.streams import Streams
-from gym_mara.errors import positive_number
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
+from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.types import Floats, Mask
 
@@ -30,6 +31,11 @@ class SensorSettings:
     def __post_init__(self) -> None:
         filtered = positive_number("velocity_filter", self.velocity_filter, "s", or_zero=True)
         object.__setattr__(self, "velocity_filter", filtered)
+
+
+def noise_of(state: SimState) -> Floats | None:
+    """The standard deviation of each arm's measured joint positions (N,), rad; None without sensor noise."""
+    return None if state.parameters is None else state.parameters.get("sensor_noise")
 
 
 class Sensors:
@@ -64,6 +70,11 @@ class Sensors:
         # The noise of each arm's episode. A new episode has a new generator, so that it does not depend on how many steps
         # the last one had: a vector environment also steps arms whose episodes have ended.
         self._generators: dict[int, np.random.Generator] = {}
+
+    @property
+    def q(self) -> Floats:
+        """The last measured joint positions (N, J), rad."""
+        return self._q.copy()
 
     def begin_episodes(self, streams: Sequence[Streams], arms: Mask) -> None:
         """Seed the noise of the chosen arms (N,) from their random generators."""
@@ -112,8 +123,36 @@ class Sensors:
         """A snapshot of the last measurements and of the noise."""
         return copy.deepcopy({"q": self._q, "qd": self._qd, "generators": self._generators})
 
+    def check(self, snapshot: Any) -> None:
+        """Check that a snapshot is one of sensors like these.
+
+        Raises:
+            GymMaraError: it is not.
+        """
+        check_fits("sensors", snapshot, self.save() | {"generators": dict})
+        arms = snapshot["generators"].keys() & range(len(self._q))
+        form = dict.fromkeys(arms, np.random.Generator)
+        check_fits("generators", snapshot["generators"], form)
+
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot."""
         snapshot = copy.deepcopy(snapshot)
         self._q, self._qd = snapshot["q"], snapshot["qd"]
         self._generators = snapshot["generators"]
+
+
+def check_noise(settings: SensorSettings, noise: Floats | None, *, tensors: bool) -> None:
+    """Check that the settings and the arrays of a backend fit its noise, from `noise_of`.
+
+    Raises:
+        GymMaraError: they do not.
+    """
+    if tensors and noise is not None:
+        raise GymMaraError(
+            "the sensors' noise is drawn on the host: leave out randomisation={'sensor_noise': …}, or choose arrays='numpy'"
+        )
+    if settings.velocity_filter and noise is None:
+        raise GymMaraError(
+            "velocity_filter smooths the velocity of noisy sensors, and these are exact: on a backend that has "
+            "'randomisation' also give randomisation={'sensor_noise': (lowest, highest)}; else leave it out"
+        )

@@ -4,45 +4,28 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.spaces import Space
+from gymnasium.spaces import Box, Space
 from numpy.typing import ArrayLike, NDArray
 
 from gym_mara import rotations
 from gym_mara.arrays import host, namespace, zeros_like
 from gym_mara.backends import backend_settings, make_backend
-from gym_mara.envs.actions import action_space, joint_targets, tensor_targets
+from gym_mara.envs.actions import Actions, make_actions
 from gym_mara.envs.options import Options
-from gym_mara.envs.sensors import Sensors
+from gym_mara.envs.outcome import Outcome, report
+from gym_mara.envs.sensors import Sensors, check_noise, noise_of
 from gym_mara.envs.statistics import EpisodeStatistics
-from gym_mara.envs.streams import Streams
+from gym_mara.envs.streams import Streams, check_streams, drawn_goals, parameter_seeds
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
-from gym_mara.types import Array, Floats, Mask
-
-
-class Outcome(NamedTuple):
-    """The result of one step, per arm, in the backend's arrays."""
-
-    observation: Floats
-    """The observations (N, O); for an arm that collided, from its colliding configuration."""
-    reward: Floats
-    """The rewards (N,)."""
-    terminated: Mask
-    """Whether the episode terminated (N,)."""
-    truncated: Mask | None
-    """Whether the arm's state diverged (N,); None if no arm's did."""
-    info: dict[str, NDArray[Any]]
-    """The task's reward terms and `collided`, each (N,); torques, contacts and random parameters, each (N, …), if the
-    state has them."""
-    state: SimState
-    """The state that the task rewarded; for an arm that collided, its colliding configuration."""
+from gym_mara.types import Floats, Mask
 
 
 class Simulation:
@@ -83,15 +66,8 @@ class Simulation:
         self.statistics = EpisodeStatistics(self.num_envs, self._tensor)
         self.streams: Sequence[Streams] = ()
         """The random generators of each arm; needed if `random` is true."""
-        if self._tensor is not None and _sensor_noise(self.backend.state) is not None:
-            raise GymMaraError(
-                "the sensors' noise is drawn on the host: leave out randomisation={'sensor_noise': …}, or choose arrays='numpy'"
-            )
-        if options.sensors.velocity_filter and _sensor_noise(self.backend.state) is None:
-            raise GymMaraError(
-                "velocity_filter smooths the velocity of noisy sensors, and these are exact: on a backend that has "
-                "'randomisation' also give randomisation={'sensor_noise': (lowest, highest)}; else leave it out"
-            )
+        noise = noise_of(self.backend.state)
+        check_noise(options.sensors, noise, tensors=self._tensor is not None)
         self._sensors = self._new_sensors()
         self.observation = Observation(
             self.task.observation(self.robot, goal, self.backend.joint_velocity),
@@ -104,11 +80,12 @@ class Simulation:
         )
         self.observation_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `present`."""
-        self.action_space = action_space(self.robot)
-        # The range of joint targets: the intersection of the action space and the joint limits, rad (m).
-        self.target_low = np.maximum(self.action_space.low.astype(np.float64), self.robot.lower)
-        self.target_high = np.minimum(self.action_space.high.astype(np.float64), self.robot.upper)
-        self._target_range = asarray(self.target_low), asarray(self.target_high)
+        self.actions = self._new_actions()
+        """What actions mean, and the last ones."""
+        self.action_space: Box[np.float32] = self.actions.space
+        """The space of one arm's actions."""
+        # The range of joint targets (J,), rad (m).
+        self.target_low, self.target_high = self.actions.target_low, self.actions.target_high
 
     @property
     def random(self) -> bool:
@@ -129,51 +106,71 @@ class Simulation:
         self.statistics.clear(chosen)
         self._started = True
         self._began[chosen] = True
-        state = self.backend.state
-        noise = _sensor_noise(state)
+        state, q = self.backend.state, self._start
+        noise = noise_of(state)
         if noise is not None:
             arms = np.ones(self.num_envs, np.bool_) if mask is None else mask
             self._sensors.begin_episodes(self.streams, arms)
-            self._sensors.begin(self._start, noise, arms)
-        return self._observe(state, noise), _report(state)
+            q = self._measured_start(noise, arms)
+        self.actions.begin(q, mask)
+        state.fill_actions(self.actions.action, self.actions.last_action)
+        return self._observe(state, noise), report(state)
 
     def _draw(self, chosen: Mask) -> None:
         """Draw the random parameters and goals of new episodes; the mask (N,) is NumPy's, because each arm has its generators."""
-        arms = np.flatnonzero(chosen).tolist()
         if self.backend.random:
-            seeds = np.zeros(self.num_envs, np.uint64)
-            for index in arms:
-                seeds[index] = self.streams[index].parameters.integers(2**63)
-            self.backend.begin_episodes(seeds, chosen)
+            self.backend.begin_episodes(parameter_seeds(self.streams, chosen), chosen)
         if self.task.random_goal:
-            position, quaternion = np.zeros((self.num_envs, 3)), np.zeros((self.num_envs, 4))
-            for index in arms:
-                drawn = self.task.draw_goal(self._workspace, self.streams[index].goals)
-                position[index], quaternion[index] = drawn
+            drawn = drawn_goals(self.task, self._workspace, self.streams, chosen)
             asarray, old = self.backend.asarray, self.goal
             xp, rows = namespace(old.position), asarray(chosen)[:, None]
-            self.goal = Goal(
-                xp.where(rows, asarray(position), old.position),
-                xp.where(rows, asarray(quaternion), old.quaternion),
+            position, quaternion = (
+                xp.where(rows, asarray(new), kept)
+                for new, kept in zip(drawn, (old.position, old.quaternion), strict=True)
             )
+            self.goal = Goal(position, quaternion)
+
+    def _measured_start(self, noise: Floats, arms: Mask) -> Floats:
+        """Where the sensors see the chosen arms (N,) at the start pose: joint positions (N, J), rad."""
+        self._sensors.begin(self._start, noise, arms)
+        return self._sensors.q
 
     def step(self, action: ArrayLike) -> Outcome:
-        """Move every arm towards its joint targets (N, J), rad, for one control period.
+        """Execute the actions (N, A) of all arms for one control period.
 
         Raises:
             GymMaraError: the action has the wrong type or shape, or is not finite. No arm moves then.
             ResetNeeded: the environment was not reset.
             ClosedEnvironmentError: the environment is closed.
         """
-        self._check_open()
-        if not self._started:
+        self._check_ready()
+        return self._move_to(self.actions.targets(action))
+
+    def step_towards(self, q_target: ArrayLike) -> Outcome:
+        """Move every arm towards joint targets (N, J), rad (m), for one control period, whatever actions mean.
+
+        Raises:
+            GymMaraError, ResetNeeded, ClosedEnvironmentError: as in `step`.
+        """
+        self._check_ready()
+        return self._move_to(self.actions.override(q_target))
+
+    def _check_ready(self) -> None:
+        if self._closed or not self._started:
+            self._check_open()
             raise ResetNeeded("call reset() before the first step()")
+
+    def _move_to(self, q_target: Floats) -> Outcome:
+        """Move every arm towards joint targets (N, J) for one control period, and judge the result."""
         xp = namespace(self._start)
-        state = self.backend.step(self._target(action, xp))
+        state, actions = self.backend.step(q_target), self.actions
+        state.fill_actions(actions.action, actions.last_action)
         self._began[...] = False
-        noise = _sensor_noise(state)
+        noise = noise_of(state)
         if noise is not None:
             self._sensors.measure(state.q, noise)
+        if actions.stepping:
+            actions.see(state.q if noise is None else self._sensors.q)
         observation = self._observe(state, noise)
         reward, terms = self._reward(state, observation)
         terminated = self.task.terminated(state, self.goal)
@@ -182,13 +179,13 @@ class Simulation:
             terminated = terminated | collided
         elif self.task.on_collision == "reset" and (count := xp.count_nonzero(collided)):
             self.backend.reset(self._start, None if count == self.num_envs else collided)
-            if noise is not None:
-                self._sensors.begin(self._start, noise, collided)
+            q = self._start if noise is None else self._measured_start(noise, collided)
+            actions.begin(q, collided)
         distance = terms["distance"] if "distance" in terms else zeros_like(reward) + np.nan
         self.statistics.add(distance, reward, collided)
         diverged = state.diverged
         truncated = diverged if diverged is not None and xp.count_nonzero(diverged) else None
-        info = {**terms, "collided": collided, **_report(state)}
+        info = {**terms, "collided": collided, **report(state)}
         self.outcome = Outcome(observation, reward, terminated, truncated, info, state)
         return self.outcome
 
@@ -256,10 +253,18 @@ class Simulation:
         self.backend.close()
         self.backend, self.backend_name, self.outcome = backend, name, None
         self._sensors = self._new_sensors()
-        noise = _sensor_noise(backend.state)
+        noise = noise_of(backend.state)
         if noise is not None:
             self._sensors.begin_episodes(self.streams, everyone)
             self._sensors.begin(q, noise, everyone)
+            q = self._sensors.q
+        self.actions = self._new_actions()
+        self.actions.begin(q, None)
+
+    def _new_actions(self) -> Actions:
+        return make_actions(
+            self.options.actions, self.task.default_action, self.robot, self.backend
+        )
 
     def _new_sensors(self) -> Sensors:
         backend = self.backend
@@ -282,37 +287,18 @@ class Simulation:
             state = state.with_q(xp.minimum(xp.maximum(state.q, low), high))
         return self.observation(state, self.goal)
 
-    def _target(self, action: ArrayLike, xp: Any) -> Floats:
-        """The joint targets of an action, clipped to the range of joint targets."""
-        if self._tensor is None:
-            target: Array = joint_targets(action).astype(np.float64, copy=False)
-        else:
-            target = tensor_targets(action, self._tensor)
-        needed = self._start.shape
-        if target.shape != needed:
-            own = slice(1 if self.num_envs == 1 else 0, None)
-            raise GymMaraError(
-                f"the action has shape {(*target.shape,)[own]}; {self.robot.name} needs {(*needed,)[own]}"
-            )
-        if xp.count_nonzero(xp.isfinite(target)) < needed[0] * needed[1]:
-            raise GymMaraError(
-                "the action contains NaN or infinity; joint targets must be finite (rad)"
-            )
-        # In half the time of target.clip for one arm.
-        low, high = self._target_range
-        return xp.minimum(xp.maximum(target, low), high)
-
     def _check_open(self) -> None:
         if self._closed:
             raise ClosedEnvironmentError("the environment is closed; make a new one")
 
     def save(self) -> dict[str, Any]:
-        """A snapshot of the arms, the sensors, the random generators, the goals and the statistics of the episodes."""
+        """A snapshot of the arms, the sensors, the last actions, the random generators, the goals and the statistics."""
         return {
             "made_with": self._made_with(),
             "backend": self.backend.save(),
             "statistics": self.statistics.copy(),
             "sensors": self._sensors.save(),
+            "actions": self.actions.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
             "goal": self._host_goal(),
@@ -336,16 +322,15 @@ class Simulation:
         made_with = snapshot.get("made_with") if isinstance(snapshot, dict) else None
         if made_with != self._made_with():
             raise GymMaraError(
-                f"the snapshot is of (robot, backend, arms) {made_with}, and this environment is {self._made_with()}: "
+                f"the snapshot is of (robot, backend, arms, action) {made_with}, and this environment is {self._made_with()}: "
                 "restore only what an environment with the same arguments has saved"
             )
-        drawn, count = np.random.Generator, self.num_envs
-        sensors = self._sensors.save() | {"generators": dict}
         form = {
             "made_with": tuple,
             "backend": dict,
             "statistics": EpisodeStatistics,
-            "sensors": sensors,
+            "sensors": dict,
+            "actions": self.actions.save(),
             "streams": tuple,
             "started": bool,
             "goal": self._host_goal(),
@@ -353,15 +338,11 @@ class Simulation:
         check_fits("snapshot", snapshot, form | others)
         steps = host(self.statistics.steps)
         check_fits("statistics.steps", snapshot["statistics"].steps, steps)
-        arms = snapshot["sensors"]["generators"].keys() & range(count)
-        check_fits("generators", snapshot["sensors"]["generators"], dict.fromkeys(arms, drawn))
-        of_arm = Streams(*[drawn] * len(Streams._fields))  # type: ignore[arg-type]
-        check_fits(
-            "streams", snapshot["streams"], (of_arm,) * (count if snapshot["streams"] else 0)
-        )
+        self._sensors.check(snapshot["sensors"])
+        check_streams(snapshot["streams"], self.num_envs)
 
-    def _made_with(self) -> tuple[str, str, int]:
-        return self.robot.name, self.backend_name, self.num_envs
+    def _made_with(self) -> tuple[str, str, int, str]:
+        return self.robot.name, self.backend_name, self.num_envs, self.actions.mode
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot that `check_snapshot` has checked.
@@ -372,6 +353,7 @@ class Simulation:
         self.backend.restore(snapshot["backend"])
         self.statistics = snapshot["statistics"].copy(self._tensor)
         self._sensors.restore(snapshot["sensors"])
+        self.actions.restore(snapshot["actions"])
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         self.outcome = None
@@ -382,23 +364,3 @@ class Simulation:
         if not self._closed:
             self._closed = True
             self.backend.close()
-
-
-def _sensor_noise(state: SimState) -> Floats | None:
-    """The standard deviation of each arm's measured joint positions (N,), rad; None without sensor noise."""
-    return None if state.parameters is None else state.parameters.get("sensor_noise")
-
-
-def _report(state: SimState) -> dict[str, NDArray[Any]]:
-    """The torques, contacts and random parameters of a state, for `info`, each (N, …)."""
-    report: dict[str, NDArray[Any]] = {}
-    if state.torque is not None:
-        report["joint_torque"] = state.torque
-    if state.contacts is not None:
-        contacts = np.empty(len(state.contacts), dtype=object)
-        for arm, found in enumerate(state.contacts):
-            contacts[arm] = [contact._asdict() for contact in found]
-        report["contacts"] = contacts
-    if state.parameters is not None:
-        report |= state.parameters
-    return report

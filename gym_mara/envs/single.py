@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.envs.actions import joint_targets
 from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
@@ -30,8 +29,9 @@ if TYPE_CHECKING:
 class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     """One arm.
 
-    The task defines the observation (O,). An action is an array of absolute joint targets (J,), rad. `info` has the
-    terms of the reward, `collided`, and the `statistics` of the episode so far (`gym_mara.envs.statistics`).
+    The task defines the observation (O,). An action (A,) is an array of absolute joint targets, rad, or what else `action`
+    chooses (`gym_mara.envs.actions`). `info` has the terms of the reward, `collided`, and the `statistics` of the episode so
+    far (`gym_mara.envs.statistics`).
 
     Args:
         task: the name of a task, such as "MARA-v0", or a Task.
@@ -40,8 +40,8 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         backend: the name of a backend.
         render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
         **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
-            (`max_joint_velocity`, …), of the sensors (`velocity_filter`) and of the rendering (`width`, `camera`, …;
-            `gym_mara.rendering.RenderSettings`).
+            (`max_joint_velocity`, …), of the actions (`action`, …), of the sensors (`velocity_filter`) and of the rendering
+            (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`).
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.
@@ -100,15 +100,15 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         return self.simulation.present(observation[0]), _info_of_one(report)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Move towards joint targets (J,), rad, for one control period.
+        """Execute an action (A,) for one control period.
 
         Raises:
             GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
-        targets = joint_targets(action)[None]
-        # The viewer steps the simulation in real time, and may replace the targets.
+        batch = self.simulation.actions.array(action)[None]
+        # The viewer steps the simulation in real time, and may replace the action.
         step = self.simulation.step if self.viewer is None else self.viewer.step
-        outcome = step(targets)
+        outcome = step(batch)
         info = _info_of_one(outcome.info)
         # At every step, because an environment does not know when Gymnasium's TimeLimit truncates its episode.
         info["statistics"] = self.simulation.statistics.of(0)

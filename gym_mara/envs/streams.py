@@ -1,11 +1,17 @@
-"""The random generators of an arm: an independent one for each purpose, so that one use does not affect another."""
+"""The random generators of an arm, an independent one for each purpose, and what they draw for a new episode."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.utils.seeding import np_random
+from numpy.typing import NDArray
+
+from gym_mara.snapshots import check_fits
+from gym_mara.tasks import Task, Workspace
+from gym_mara.types import Floats, Mask
 
 
 class Streams(NamedTuple):
@@ -32,3 +38,31 @@ class Streams(NamedTuple):
     def seeded(cls, seed: int | None) -> Streams:
         """The streams of an environment after reset(seed=seed); None for a random seed."""
         return cls.of(np_random(seed)[0])
+
+
+def parameter_seeds(streams: Sequence[Streams], chosen: Mask) -> NDArray[np.uint64]:
+    """The seeds (N,) from which a backend draws the parameters of new episodes, for the chosen arms (N,)."""
+    seeds = np.zeros(len(chosen), np.uint64)
+    for arm in np.flatnonzero(chosen).tolist():
+        seeds[arm] = streams[arm].parameters.integers(2**63)
+    return seeds
+
+
+def drawn_goals(
+    task: Task, workspace: Workspace, streams: Sequence[Streams], chosen: Mask
+) -> tuple[Floats, Floats]:
+    """The goals of new episodes of the chosen arms (N,): positions (N, 3), m, and quaternions (N, 4); zero for other arms."""
+    position, quaternion = np.zeros((len(chosen), 3)), np.zeros((len(chosen), 4))
+    for arm in np.flatnonzero(chosen).tolist():
+        position[arm], quaternion[arm] = task.draw_goal(workspace, streams[arm].goals)
+    return position, quaternion
+
+
+def check_streams(streams: Any, num_envs: int) -> None:
+    """Check the streams of a snapshot: those of N arms, or none.
+
+    Raises:
+        GymMaraError: they are something else.
+    """
+    of_arm = Streams(*[np.random.Generator] * len(Streams._fields))  # type: ignore[arg-type]
+    check_fits("streams", streams, (of_arm,) * (num_envs if streams else 0))

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from gym_mara.arrays import host, is_tensor, namespace
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.envs.options import Options, check_reset_options
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import view_of
@@ -175,7 +176,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.simulation.streams = tuple(streams[index] for index in range(self.num_envs))
 
     def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
-        """Move every arm towards its joint targets (N, J), rad, for one control period.
+        """Execute the actions (N, A) of all arms for one control period.
 
         Raises:
             GymMaraError: the actions have the wrong type or shape, or are not finite, or an ended episode was not reset. No arm

@@ -24,7 +24,12 @@ _QUICK = {"ftol": 1e-3, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 100}
 _PRECISE = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 300}
 
 
-def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
+def solve_ik(
+    robot: RobotModel,
+    position: Floats,
+    quaternion: Floats | None,
+    start: Floats | None = None,
+) -> Floats:
     """The configuration (J,), rad, within the limits, that comes closest to a pose, regardless of collisions.
 
     Closest means the least sum of squares of the position error, m, and the rotation error, rad.
@@ -33,6 +38,8 @@ def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> 
         robot: the arm.
         position: of the end-effector frame in the world (3,), m.
         quaternion: its orientation [w, x, y, z]; None if any orientation will do.
+        start: the configuration (J,) to search from first, rad, within the limits; None for home. A solution that the search
+            finds from there is often, but not always, the nearest one.
     """
     # Imported here because that takes a third of a second, and few environments need it.
     from scipy.optimize import least_squares
@@ -43,8 +50,9 @@ def solve_ik(robot: RobotModel, position: Floats, quaternion: Floats | None) -> 
         return robot.home.copy()
     bounds = robot.lower[free], robot.upper[free]
     best, least = robot.home[free], np.inf
-    for start in _starts(robot, position, quaternion):
-        found = least_squares(error, start[free], error.jacobian, bounds, **_QUICK)
+    first = robot.home if start is None else start
+    for guess in _starts(robot, position, quaternion, first):
+        found = least_squares(error, guess[free], error.jacobian, bounds, **_QUICK)
         if found.cost < least:
             best, least = found.x, found.cost
         if least <= 0.5 * _REACHED**2:
@@ -61,8 +69,10 @@ def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tupl
     return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
 
 
-def _starts(robot: RobotModel, position: Floats, quaternion: Floats | None) -> Floats:
-    """Where to start from (S, J): home, then fixed random configurations, the nearest to the pose first."""
+def _starts(
+    robot: RobotModel, position: Floats, quaternion: Floats | None, first: Floats
+) -> Floats:
+    """Where to start from (S, J): the first, then fixed random configurations, the nearest to the pose first."""
     kinematics = robot.kinematics()
     # One turn of a revolute joint is enough, that around zero if it is within the limits; a prismatic joint needs its
     # whole travel.
@@ -75,7 +85,7 @@ def _starts(robot: RobotModel, position: Floats, quaternion: Floats | None) -> F
     distance = np.linalg.norm(positions - position, axis=1)
     if quaternion is not None:
         distance = np.hypot(distance, rotations.angle_between(quaternions, quaternion))
-    return np.vstack([robot.home, random[np.argsort(distance)]])
+    return np.vstack([first, random[np.argsort(distance)]])
 
 
 class _PoseError:

@@ -9,16 +9,37 @@ for MARA's pose on one core: one configuration takes Pinocchio 5 µs; 256 take i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from gym_mara import rotations
+from gym_mara.arrays import Constants
 from gym_mara.types import Floats, Mask
 
 # From this many configurations on NumPy is faster.
 BATCH_FROM = 24
+# The two components after each, of a cross product.
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+_SAME = 1e-24
+"""Two unit vectors whose difference has at most this square are the same."""
+
+
+class JointFrames(NamedTuple):
+    """Where the joints of N arms are in the world, and the end-effector frame that they move."""
+
+    axes: Floats
+    """Unit vectors along the joints' axes (N, J, 3); a prismatic joint slides along its axis."""
+    origins: Floats
+    """Points on the joints' axes (N, J, 3), m."""
+    position: Floats
+    """The position of the end-effector frame (N, 3), m."""
+    rotation: Floats
+    """Its orientation as rotation matrices (N, 3, 3)."""
+    jacobian: Floats
+    """The Jacobian (N, 6, J) of the end-effector frame: the linear velocity of its origin and its angular velocity, both in
+    the world, per unit of each joint's velocity (Pinocchio's LOCAL_WORLD_ALIGNED)."""
 
 
 class Kinematics:
@@ -53,6 +74,7 @@ class Kinematics:
         placements = np.array([p.homogeneous for p in model.jointPlacements[chain]])
         self._terms = (placements[:, None] @ local).reshape(len(motions), 3, 16)
         self._buffers: dict[int, tuple[Floats, Floats]] = {}
+        self._frames = Constants(*self._along_z(placements))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._model, self._frame)
@@ -104,6 +126,68 @@ class Kinematics:
         turning = np.cross(axes, tool - frames[:, :, :3, 3])
         columns = np.where(self.prismatic[:, None, None], axes, turning)
         return (columns * qd.T[:, :, None]).sum(axis=0)
+
+    def joint_frames(self, q: Floats) -> JointFrames:
+        """The joint axes, the end-effector frame and its Jacobian at q (N, J), as arrays like q: of NumPy or torch."""
+        xp, steps, tool, turns, identity = self._frames.like(q)
+        count, across = len(q), q.T
+        cosine, sine = xp.cos(across), xp.sin(across)
+        # Row i of `basis` is the i-th basis vector of the last frame: its components, each for all arms.
+        basis = xp.tile(identity[:, :, None], (1, 1, count)).reshape(3, -1)
+        point = xp.zeros_like(xp.tile(across[:1], (3, 1)))
+        axes, origins = [], []
+        for joint, slides in enumerate(self.prismatic.tolist()):
+            x, y, z, way = (steps[joint] @ basis).reshape(4, 3, count)
+            point = point + way
+            axes.append(z)
+            origins.append(point)
+            if slides:
+                point = point + across[joint] * z
+            else:
+                c, s = cosine[joint], sine[joint]
+                x, y = c * x + s * y, c * y - s * x
+            basis = xp.stack([x, y, z]).reshape(3, -1)
+        *rotation, way = (tool @ basis).reshape(4, 3, count)
+        axis, origin, position = xp.stack(axes), xp.stack(origins), point + way
+        arm = position - origin
+        turning = axis[:, _NEXT] * arm[:, _AFTER] - axis[:, _AFTER] * arm[:, _NEXT]
+        linear, angular = axis + turns * (turning - axis), turns * axis
+        jacobian = xp.permute_dims(xp.concat([linear, angular], axis=1), (2, 1, 0))
+        by_arm = (2, 0, 1)
+        return JointFrames(
+            xp.permute_dims(axis, by_arm),
+            xp.permute_dims(origin, by_arm),
+            position.T,
+            xp.permute_dims(xp.stack(rotation), (2, 1, 0)),
+            jacobian,
+        )
+
+    def _along_z(self, placements: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """The constants of `joint_frames`, in which each joint moves about or along the z axis of its frame.
+
+        Args:
+            placements: of the joints in their parents' frames (J, 4, 4).
+
+        Returns:
+            From each joint's frame to the next one's (J, 4, 3), and from the last to the end effector (4, 3): three basis
+            vectors and the way between the origins, as combinations of the basis; which joints turn, as 1 and 0 (J, 1, 1);
+            and the identity (3, 3).
+        """
+        before, steps = np.eye(3), []
+        for placement, axis in zip(placements, self._axes, strict=True):
+            # A Householder matrix swaps the z axis and the joint's axis; with its x axis reversed it is a rotation.
+            apart = np.array([0.0, 0.0, 1.0]) - axis
+            turn = np.eye(3)
+            if (square := apart @ apart) > _SAME:
+                turn = turn - 2.0 / square * np.outer(apart, apart)
+                turn[:, 0] *= -1.0
+            rotation, way = placement[:3, :3] @ turn, placement[:3, 3]
+            steps.append(np.vstack([(before.T @ rotation).T, before.T @ way]))
+            before = turn
+        tool = self._tool[0]
+        last = np.vstack([(before.T @ tool[:3, :3]).T, before.T @ tool[:3, 3]])
+        turns = np.logical_not(self.prismatic).astype(np.float64)[:, None, None]
+        return np.array(steps), last, turns, np.eye(3)
 
     def points(self, q: Floats, bodies: Sequence[int], points: Floats) -> Floats:
         """The positions in the world (P, N, 3), m, of points that are fixed to bodies of the arm, at q (N, J).

@@ -51,6 +51,9 @@ class Task(ABC):
     preset_family: ClassVar[str] = ""
     """The family of tasks for which an algorithm may have presets of its own; see docs/add_an_algorithm.md."""
 
+    default_action: ClassVar[str] = "absolute"
+    """The action mode of the environments unless the keyword argument `action` chooses one."""
+
     on_collision: str = "reset"
     """The effect of a collision: "reset" (the arm returns to the start pose and the episode continues), "terminate" or
     "continue"."""
@@ -99,8 +102,8 @@ class Task(ABC):
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
         """The rewards (N,), and their terms by name, each (N,), which `info` reports.
 
-        Three names have a special meaning: the episode statistics use `distance` (m), and an evaluation prints
-        `position_error` (m) and `angle_error` (rad).
+        Four names have a special meaning: the episode statistics use `distance` (m), and an evaluation uses
+        `position_error` (m), `angle_error` (rad) and `success` (bool, whether the arm is within the task's tolerances).
         """
 
     def terminated(self, state: SimState, goal: Goal) -> Mask:

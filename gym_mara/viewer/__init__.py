@@ -18,7 +18,7 @@ def watch(
     env: str,
     backend: str,
     keywords: dict[str, Any],
-    policy: Callable[[Any], ArrayLike] | None = None,
+    policy: Callable[[Any], ArrayLike | None] | None = None,
     *,
     speed: float = 1.0,
     seed: int | None = None,
@@ -29,8 +29,8 @@ def watch(
         env: the name of an environment.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad; it plays one
-            episode after the other. None: the user moves the joints with the sliders, from the home configuration, in one
+        policy: maps observations of one arm, with a leading axis of length 1, to actions (1, A); it plays one episode
+            after the other. None: the user moves the joints with the sliders, from the home configuration, in one
             episode without an end.
         speed: the speed of the simulation relative to real time.
         seed: the seed of the environment.
@@ -52,8 +52,7 @@ def watch(
             viewer.run(policy, environment(env).max_episode_steps)
         else:
             viewer.jog()
-            home = simulation.robot.home[None]
-            viewer.run(lambda _: home, None)
+            viewer.run(lambda _: None, None)
     finally:
         if viewer is not None:
             viewer.close()

@@ -11,7 +11,8 @@ import numpy as np
 import viser
 
 from gym_mara.backends import backend_names
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
 from gym_mara.types import Floats
 from gym_mara.viewer.gate import boolean, number, one_of
 

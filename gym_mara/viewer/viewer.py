@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gym_mara.envs.simulation import Outcome, Simulation
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.extras import needs
@@ -74,11 +75,11 @@ class Viewer:
             gate.let_in(control, check)
         self._connect_controls()
 
-    def run(self, policy: Callable[[Any], ArrayLike], episode_steps: int | None) -> None:
+    def run(self, policy: Callable[[Any], ArrayLike | None], episode_steps: int | None) -> None:
         """Play a policy, one episode after the other, until the user interrupts.
 
         Args:
-            policy: maps observations of one arm, with a leading axis of length 1, to joint targets (1, J), rad.
+            policy: maps observations of one arm, with a leading axis of length 1, to actions as in `step`.
             episode_steps: the length of an episode; None for no end.
         """
         while True:
@@ -90,16 +91,22 @@ class Viewer:
                 if outcome.terminated.any() or outcome.truncated is not None:
                     break
 
-    def step(self, targets: ArrayLike) -> Outcome:
-        """Wait until the next step is due, then step towards joint targets (1, J), rad.
+    def step(self, action: ArrayLike | None) -> Outcome:
+        """Wait until the next step is due, then step with the actions (1, A) of one arm; None moves it to its home pose.
 
-        While the user jogs the joints, the sliders replace these targets.
+        While the user jogs the joints, the joint targets of the sliders take their place.
 
         Raises:
-            GymMaraError: the targets have the wrong shape or are not finite.
+            GymMaraError: the action has the wrong shape or is not finite.
         """
         self._wait()
-        outcome = self._simulation.step(self._panel.targets() if self._jogging else targets)
+        simulation = self._simulation
+        if self._jogging:
+            outcome = simulation.step_towards(self._panel.targets())
+        elif action is None:
+            outcome = simulation.step_towards(simulation.robot.home[None])
+        else:
+            outcome = simulation.step(action)
         self._panel.add(outcome)
         now = time.monotonic()
         if now - self._drawn >= _FRAME_PERIOD or not self._playing:

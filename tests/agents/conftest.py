@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from gym_mara.agents.runs import evaluation
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train, use_one_thread
+from gym_mara.registration import Environment, environment
 
 ROLLOUT = 256 * 2
 """Steps between two updates of PPO's tuned preset."""
@@ -28,6 +30,15 @@ def config(**changes: object) -> RunConfig:
 
 def silent(steps: int, shown: dict[str, float]) -> None:
     """Ignore the progress."""
+
+
+def shorten_episodes(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    """Let the episodes in which policies are measured have this many steps."""
+
+    def short(name: str) -> Environment:
+        return environment(name)._replace(max_episode_steps=steps)
+
+    monkeypatch.setattr(evaluation, "environment", short)
 
 
 @pytest.fixture(scope="session", autouse=True)

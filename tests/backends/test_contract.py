@@ -56,6 +56,7 @@ RANDOM = {
     "sensor_noise": (0.0, 1e-3),
 }
 TRAVELLING = {"max_joint_velocity": 1.0}
+SERVOS = {"servo_gain": 10.0}
 # Two physics steps, because each takes long on a CPU; and room for arms that random poses put deep into the table.
 WARP = DEVICES["warp"] | {"control_period": 0.008, "physics_step": 0.004, "max_contacts": 96}
 OTHER_ROBOTS = ("3 joints", "7 joints", "rail")
@@ -65,9 +66,12 @@ CASES = {
     "warp": Case("warp", WARP),
     "warp, kinematic": Case("warp", WARP | {"dynamics": False}),
     "warp, travelling": Case("warp", WARP | {"max_joint_velocity": 1.5, "dynamics": False}),
+    "warp, servos": Case("warp", WARP | SERVOS | {"dynamics": False}),
     "warp, random": Case("warp", WARP | {"randomisation": RANDOM, "on_divergence": "truncate"}),
     "warp, rail": Case("warp", WARP | {"physics_step": 0.002}, "rail"),
     "pinocchio, travelling": Case("pinocchio", TRAVELLING),
+    "pinocchio, servos": Case("pinocchio", SERVOS),
+    "pinocchio, servos, rail": Case("pinocchio", SERVOS, "rail"),
     "pinocchio, fcl": Case("pinocchio", {"collision": "fcl"}),
     "pinocchio, threads": Case("pinocchio", {"collision_threads": 2}),
     "dart, random": Case(

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gym_mara.backends import make_backend
 from gym_mara.backends.pinocchio import PinocchioBackend
+from gym_mara.backends.servo_motion import servo_motion
 from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
@@ -267,3 +269,72 @@ def test_other_robots_travel_too(name: str) -> None:
 def test_settings_out_of_their_range(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(GymMaraError, match=message):
         _backend(**settings)
+
+
+# Joints with the law of a servo.
+
+
+def test_joints_with_servos_follow_the_law_exactly() -> None:
+    backend = _backend(20, servo_gain=10.0, max_joint_velocity=1.0, collision="none")
+    q, target = uniform_q(backend.robot, 20, 2), uniform_q(backend.robot, 20, 3)
+    target[:10] = q[:10] + 0.02 * target[:10]  # near their targets, they approach exponentially
+    backend.reset(q)
+    assert not backend.teleports
+    gain, limit = np.array(10.0), np.ones(6)
+    for number in range(1, 40):
+        state = backend.step(target)
+        expected = q + servo_motion(q, target, gain, limit, np.array(number * PERIOD))
+        np.testing.assert_allclose(state.q, expected, rtol=0.0, atol=1e-12)
+        law = np.clip(10.0 * (target - state.q), -1.0, 1.0)
+        np.testing.assert_allclose(state.qd, law, rtol=0.0, atol=1e-12)
+
+
+def test_without_max_joint_velocity_servos_have_the_limits_of_the_robot() -> None:
+    robot = RobotModel.load("mara", velocity_limit=(0.5, 1.57, 0.3, 1.0, 0.1, 1.57))
+    backend = PinocchioBackend(robot, 1, servo_gain=10.0)
+    backend.reset(np.zeros((1, 6)))
+    state = backend.step(np.ones((1, 6)))
+    np.testing.assert_allclose(state.q[0], robot.velocity_limit * PERIOD, rtol=1e-12)
+    np.testing.assert_array_equal(state.qd[0], robot.velocity_limit)
+
+
+@pytest.mark.parametrize("period", [1.0, PERIOD])
+def test_a_servos_path_that_collides_between_its_free_ends_stops_at_the_contact(
+    period: float,
+) -> None:
+    start, target = np.array(PATH_ENDS)
+    backend = _backend(servo_gain=10.0, max_joint_velocity=10.0, control_period=period)
+    backend.reset(start[None])
+    for _ in range(100):
+        state = backend.step(target[None])
+        if state.collided[0]:
+            break
+    # The tool collides from -1.15 rad on, and may be `path_resolution` further.
+    assert state.q[0, 3] == pytest.approx(-1.15, abs=0.1)
+    assert not state.qd.any()
+    free = state.q - 0.1 * (target - start) / np.abs(target - start).max()
+    assert not make_checker("coal", backend.robot).check(free).any()
+
+
+@pytest.mark.parametrize("name", ["dart", "mujoco"])
+def test_one_action_moves_the_arm_as_with_dynamics(name: str) -> None:
+    """Motors take a moment to reach their velocity: they lag by less than 3 mrad for targets within 50 mrad."""
+    mara = robot_model("mara")
+    dynamic = make_backend(name, mara, 8, {"servo_gain": 10.0})
+    kinematic = PinocchioBackend(mara, 8, servo_gain=10.0)
+    q = uniform_q(mara, 8, 0, furthest=0.6)
+    target = q + uniform_q(mara, 8, 1, furthest=0.05)
+    for backend in (dynamic, kinematic):
+        backend.reset(q)
+    for _ in range(50):
+        state, expected = dynamic.step(target), kinematic.step(target)
+        assert not expected.collided.any()
+        np.testing.assert_allclose(state.q, expected.q, rtol=0.0, atol=3e-3)
+    np.testing.assert_allclose(state.q, expected.q, rtol=0.0, atol=1e-4)
+    dynamic.close()
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0, np.nan, "10", True])
+def test_a_wrong_gain_is_refused(gain: Any) -> None:
+    with pytest.raises(GymMaraError, match="servo_gain must be finite and positive"):
+        _backend(servo_gain=gain)

@@ -156,7 +156,16 @@ def test_random_parameters_act_as_in_mujoco(mara: RobotModel, name: str) -> None
         np.testing.assert_allclose(mine.torque, theirs.torque, rtol=0.01, atol=0.3)
 
 
-@pytest.mark.parametrize("settings", [{}, {"max_joint_velocity": 1.0}], ids=str)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"max_joint_velocity": 1.0},
+        {"servo_gain": 10.0},
+        {"servo_gain": 10.0, "max_joint_velocity": 1.0},
+    ],
+    ids=str,
+)
 def test_without_dynamics_it_moves_as_the_backend_pinocchio(
     mara: RobotModel, settings: dict[str, Any]
 ) -> None:

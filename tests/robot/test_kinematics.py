@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
 
 from gym_mara.robot import RobotModel
 from gym_mara.robot.catalog import robot_names
@@ -150,3 +152,49 @@ def test_points_are_where_pinocchio_places_them(name: str, tmp_path: Path) -> No
         pin.forwardKinematics(robot.model, data, configuration)
         expected = [data.oMi[b + 1].act(p) for b, p in zip(bodies, points, strict=True)]
         np.testing.assert_allclose(placed[:, row], expected, rtol=0.0, atol=1e-12)
+
+
+def _assert_frames_are_pinocchios(robot: RobotModel, count: int) -> None:
+    q = uniform_q(robot, count, 0)
+    kinematics = robot.kinematics()
+    frames = kinematics.joint_frames(q)
+    data, chain = robot.model.createData(), range(1, 1 + robot.num_joints)
+    for row, configuration in enumerate(q):
+        expected = pin.computeFrameJacobian(
+            robot.model, data, configuration, robot.ee_frame_id, pin.LOCAL_WORLD_ALIGNED
+        )[:, : robot.num_joints]
+        np.testing.assert_allclose(frames.jacobian[row], expected, rtol=0.0, atol=1e-12)
+        pose = pin.updateFramePlacement(robot.model, data, robot.ee_frame_id)
+        np.testing.assert_allclose(frames.position[row], pose.translation, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(frames.rotation[row], pose.rotation, rtol=0.0, atol=1e-12)
+        for joint, slides in zip(chain, kinematics.prismatic, strict=True):
+            world, moves = data.oMi[joint], robot.motion(joint)
+            axis = world.rotation @ (moves[:3] if slides else moves[3:])
+            np.testing.assert_allclose(frames.axes[row, joint - 1], axis, rtol=0.0, atol=1e-12)
+            away = world.translation - frames.origins[row, joint - 1]
+            # A joint that slides has moved its own frame along its axis.
+            away = away - (away @ axis) * axis if slides else away
+            np.testing.assert_allclose(away, 0.0, atol=1e-12)
+    tensor_q: Any = torch.tensor(q)
+    tensors: Any = kinematics.joint_frames(tensor_q)
+    for tensor, array in zip(tensors, frames, strict=True):
+        np.testing.assert_allclose(tensor.numpy(), array, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mara", "ur5", "panda"])
+def test_joint_frames_and_jacobian_are_pinocchios(name: str) -> None:
+    for count in (1, 50):
+        _assert_frames_are_pinocchios(robot_model(name), count)
+
+
+def test_joint_frames_of_sliding_and_slanting_joints_are_pinocchios(tmp_path: Path) -> None:
+    kinds = [
+        joint_xml(0, "prismatic", "0 1 0"),
+        joint_xml(1, "revolute", "1 2 -0.5"),
+        joint_xml(2, "continuous", "0 0 -1"),
+        joint_xml(3, "prismatic", "1 0 1"),
+        joint_xml(4, "revolute", "0 0 1"),
+    ]
+    robot = RobotModel.load(write(tmp_path / "stick.urdf", urdf_xml(*kinds)), "link5")
+    for batch in (1, 20):
+        _assert_frames_are_pinocchios(robot, batch)

@@ -58,3 +58,21 @@ def test_the_plots_have_space_for_their_labels(shown: Loop) -> None:
     (error,) = plots[1].data[1][-1:]
     assert error == pytest.approx(1e6 * shown.info["position_error"]), "in µm: decimals are cut off"
     assert is_short(round(error, 3))
+
+
+def test_the_user_jogs_to_joint_targets_whatever_actions_mean() -> None:
+    loop = Loop(action="relative", action_scale=0.01)
+    simulation, viewer = loop.env.simulation, loop.viewer
+    before = simulation.observed(0).q[0]
+    viewer.jog()
+    for slider in viewer._panel.sliders:
+        slider.value = 0.02
+    loop.env.step(ACTION)
+    np.testing.assert_allclose(simulation.observed(0).q[0], 0.02, atol=1e-9)
+    viewer._request(_jogging=False)
+    loop.env.step(ACTION)
+    np.testing.assert_allclose(simulation.observed(0).q[0], 0.02 + 0.01 * ACTION, atol=1e-9)
+    viewer.step(None)
+    np.testing.assert_allclose(simulation.observed(0).q[0], simulation.robot.home, atol=1e-9)
+    assert before.any()
+    loop.env.close()

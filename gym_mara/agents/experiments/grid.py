@@ -299,9 +299,8 @@ def _result(run: RunFolder) -> Result:
 
 
 def _metrics(run: RunFolder, which: str) -> Metrics:
-    means = {
-        name: float(v.mean()) for name, v in evaluate_run(run, episodes=1, which=which).items()
-    }
+    measured = evaluate_run(run, episodes=1, which=which)
+    means = {name: float(measured[name].mean()) for name in Metrics.__annotations__}
     metrics: Any = {name: value if math.isfinite(value) else None for name, value in means.items()}
     return cast("Metrics", metrics)
 

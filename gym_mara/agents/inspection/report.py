@@ -8,11 +8,13 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gym_mara.agents.evaluation.episodes import episode_seeds
+from gym_mara.agents.evaluation.metrics import METRICS, measure, statistics_in_short
+from gym_mara.agents.evaluation.rollout import roll_out
 from gym_mara.agents.inspection import report_figures as figures
 from gym_mara.agents.inspection.report_figures import Episode
-from gym_mara.agents.inspection.rollout import Player, roll_out
 from gym_mara.agents.inspection.watch import film_run
-from gym_mara.agents.runs.evaluation import options_on
+from gym_mara.agents.runs.evaluation import Player, options_on
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import usable_backends
 from gym_mara.errors import GymMaraError
@@ -51,13 +53,15 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
     episodes = []
     for backend in backends:
         with Player(run, backend, options_on(backend, config), which=which) as player:
-            robot, target = player.env.simulation.robot, player.env.simulation.goal.position[0]
-            episodes.append(Episode(backend, roll_out(player)))
+            steps, first = player.episode_steps, episode_seeds(0, 0, 1)
+            episodes.append(Episode(backend, roll_out(player.env, player.begin, first, steps)))
+            robot = player.env.simulation.robot
     page = _template().render(
         title=f"{config.env}, {config.algo.upper()}",
         subtitle=f"{config.steps:,} steps on {config.backend}, seed {config.seed}, preset {config.preset_name}; "
         f"the {which} policy, deterministic",
         episodes=episodes,
+        rows=_rows(episodes),
         missing=missing,
         video_seconds=_VIDEO_SECONDS,
         video=_video(run, backends, which),
@@ -65,7 +69,7 @@ def write_report(run: RunFolder, file: Path | None = None, *, which: str = "last
         errors=_markup(figures.errors(episodes)),
         joints=_markup(figures.joints(episodes, robot)),
         torques=_markup(figures.torques(episodes, robot)),
-        path=_markup(figures.path(episodes, target)),
+        path=_markup(figures.path(episodes, episodes[0].played.target[0])),
         configuration=read_text(run.path / "config.json"),
     )
     write_text(file, page, new=new)
@@ -94,6 +98,16 @@ def _template() -> Template:
 def _markup(figure: go.Figure | None, *, with_library: bool = False) -> Markup | None:
     """A figure as HTML that is not escaped again: Plotly escapes the texts in it."""
     return None if figure is None else Markup(figures.as_html(figure, with_library=with_library))
+
+
+def _rows(episodes: list[Episode]) -> list[tuple[str, list[str]]]:
+    """A row for each metric that an episode has: its title, and its value on each backend."""
+    measured = [measure(episode.played) for episode in episodes]
+    rows = [
+        (title, [statistics_in_short(name, m[name])[0] for m in measured])
+        for name, title in METRICS.items()
+    ]
+    return [(title, values) for title, values in rows if set(values) != {"-"}]
 
 
 def _video(run: RunFolder, backends: list[str], which: str) -> str:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import Trajectory
-from gym_mara.agents.inspection.transfer import settling_time
+from gym_mara.agents.evaluation.metrics import settling_time
+from gym_mara.agents.evaluation.rollout import Trajectory
 from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.extras import needs
 from gym_mara.robot import RobotModel
@@ -182,7 +182,7 @@ def _colour(number: int) -> str:
 
 def _until_settled(episodes: Episodes) -> list[float]:
     """The range of time that a figure shows first, s: twice the time that the slowest of the settled arms needs."""
-    times = [settling_time(e.played.position_error, e.played.period)[0] for e in episodes]
+    times = [settling_time(e.played)[0] for e in episodes]
     settled = [time for time in times if np.isfinite(time)]
     longest = max(episode.seconds[-1] for episode in episodes)
     return [0.0, max(1.0, 2.0 * max(settled)) if settled else longest]

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.inspection.rollout import VELOCITY_LIMIT, Player
-from gym_mara.agents.runs.evaluation import options_on
+from gym_mara.agents.runs.evaluation import VELOCITY_LIMIT, Player, options_on
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path, labelled
 from gym_mara.viewer import watch
@@ -102,7 +101,7 @@ def watch_run(
     """
     settings = _settings(run, backend, options, which, log)
     with Player(run, backend, settings, which=which) as player:
-        act = player.act
+        act, settings = player.act, player.options
     watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
 
 

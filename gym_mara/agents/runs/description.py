@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from gymnasium.spaces import Dict, flatdim
 from pydantic import Field
 
 from gym_mara.agents.runs.config import DamagedRunError
 from gym_mara.agents.runs.folder import versions
+from gym_mara.backends import backend_settings
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
-from gym_mara.files import DamagedFileError, read_json
+from gym_mara.files import read_json
 from gym_mara.robot.fingerprint import fingerprint
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
@@ -43,8 +45,38 @@ class Normalisation:
 
 
 @dataclass(frozen=True)
-class PolicyDescription:
-    """The content of policy.json: what a policy observes, and what its actions mean.
+class ActionDescription:
+    """What the actions of an environment mean, in the terms of its keyword arguments `action`, `action_scale`, `action_from`."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
+
+    mode: Literal["absolute", "relative", "cartesian"]
+    steps: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(max_length=1000)]
+    """What the action 1 means: a step of each joint, rad (m for a prismatic joint), or each component of a twist, m/s and rad/s;
+    empty for absolute actions."""
+    reference: Literal["position", "target"]
+    """Where the steps begin."""
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The keyword arguments of an environment with these actions."""
+        if self.mode == "absolute":
+            return {"action": self.mode}
+        return {
+            "action": self.mode,
+            "action_scale": list(self.steps),
+            "action_from": self.reference,
+        }
+
+
+ABSOLUTE = ActionDescription("absolute", [], "position")
+_FIRST_PERIOD = 0.02
+"""The control period of policies in the first format, s."""
+
+
+@dataclass(frozen=True)
+class _Description:
+    """What the formats share.
 
     Raises:
         GymMaraError: lengths differ, or a range is empty.
@@ -52,13 +84,13 @@ class PolicyDescription:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID
 
-    format: Literal[1]
+    format: int
     joints: Annotated[list[str], Field(min_length=1, max_length=1000)]
-    """The names of the joints, in the order of the actions."""
+    """The names of the joints, in the order of the robot's chain."""
     low: _Numbers
-    """The joint targets of the action -1, rad."""
+    """The lower bounds of the environment's actions, which the policy's -1 means."""
     high: _Numbers
-    """The joint targets of the action 1, rad."""
+    """The upper bounds, which the policy's 1 means."""
     observation: Annotated[list[ObservationPart], Field(min_length=1, max_length=1000)]
     """The parts of the observation, in order."""
     groups: dict[str, Annotated[int, Field(ge=1, le=10_000)]] | None
@@ -70,8 +102,8 @@ class PolicyDescription:
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
-        if not len(self.joints) == len(self.low) == len(self.high):
-            raise GymMaraError("'joints', 'low' and 'high' must have the same length")
+        if len(self.low) != len(self.high):
+            raise GymMaraError("'low' and 'high' must have the same length")
         if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):
             raise GymMaraError("'low' must not be above 'high'")
         if self.groups is not None and (
@@ -95,6 +127,37 @@ class PolicyDescription:
         """The parts of the observation with their sizes, for messages."""
         return ", ".join(f"{part.name} ({part.size})" for part in self.observation)
 
+
+@dataclass(frozen=True)
+class _FirstDescription(_Description):
+    """The first format, of policies that act with absolute joint targets."""
+
+    format: Literal[1]
+
+
+@dataclass(frozen=True)
+class PolicyDescription(_Description):
+    """The content of policy.json: what a policy observes, and what its actions mean.
+
+    Raises:
+        GymMaraError: lengths differ, or a range is empty.
+    """
+
+    format: Literal[2]
+    action: ActionDescription
+    control_period: Annotated[float, Field(gt=0.0)]
+    """How long a step lasted in the training, s."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        mode, steps = self.action.mode, len(self.action.steps)
+        size = 6 if mode == "cartesian" else len(self.joints)
+        if len(self.low) != size or steps != (0 if mode == "absolute" else size):
+            raise GymMaraError(
+                f"with {mode} actions of {len(self.joints)} joints 'low' and 'high' must have {size} numbers, and 'steps' "
+                f"{0 if mode == 'absolute' else size}"
+            )
+
     def check(self, simulation: Simulation, *, any_robot: bool = False) -> None:
         """Check that the policy can act in a simulation.
 
@@ -103,7 +166,7 @@ class PolicyDescription:
             any_robot: whether the robot may differ from the one of the training in more than its name.
 
         Raises:
-            GymMaraError: the robot or the observation is another one.
+            GymMaraError: the robot, the observation or the meaning of actions is another one.
         """
         robot = simulation.robot
         if robot.num_joints != len(self.joints):
@@ -123,6 +186,45 @@ class PolicyDescription:
                 f"the policy does not fit the environment: it observes {self.layout}, and the environment "
                 f"has {theirs}"
             )
+        self._check_action(simulation)
+
+    def _check_action(self, simulation: Simulation) -> None:
+        """Check that the actions of a simulation mean what the policy's do.
+
+        Raises:
+            GymMaraError: they do not.
+        """
+        own, theirs = self.action, _action(simulation)
+        if own.mode != theirs.mode:
+            raise GymMaraError(
+                f"the policy does not fit the environment: its actions are {own.mode}, and those of the environment "
+                f"{theirs.mode}: leave out action={theirs.mode!r}"
+            )
+        if own.reference != theirs.reference:
+            raise GymMaraError(
+                f"the policy does not fit the environment: its steps begin at the {own.reference}, and those of the environment "
+                f"at the {theirs.reference}: leave out action_from={theirs.reference!r}"
+            )
+        if not np.allclose(own.steps, theirs.steps, rtol=1e-9, atol=0.0):
+            raise GymMaraError(
+                f"the policy does not fit the environment: its action 1 means {own.steps}, and that of the environment "
+                f"{theirs.steps}: leave out action_scale"
+            )
+
+    def keywords(self, backend: str, options: dict[str, Any]) -> dict[str, Any]:
+        """The keyword arguments of an environment in which the policy plays.
+
+        Args:
+            backend: the name of the backend.
+            options: keyword arguments that are given; the policy's action mode and steps are added, and for steps the
+                policy's control period, because they are made for it.
+        """
+        own = self.action.keywords
+        if options.get("action", self.action.mode) != self.action.mode:
+            return options  # `check` says what is wrong
+        if self.action.mode != "absolute" and "control_period" in backend_settings(backend):
+            own["control_period"] = self.control_period
+        return own | options
 
 
 def read_description(folder: Path) -> PolicyDescription:
@@ -136,16 +238,21 @@ def read_description(folder: Path) -> PolicyDescription:
             f"the policy in {str(folder)!r} is of an older version of gym_mara, which did not store what its actions "
             "mean: train it again"
         )
+    form: Any = Annotated[_FirstDescription | PolicyDescription, Field(discriminator="format")]
     try:
-        return read_json(folder / "policy.json", PolicyDescription)
-    except DamagedFileError as error:
+        read = read_json(folder / "policy.json", form)
+        if isinstance(read, PolicyDescription):
+            return read
+        second: dict[str, Any] = {"format": 2, "action": ABSOLUTE, "control_period": _FIRST_PERIOD}
+        return PolicyDescription(**(vars(read) | second))
+    except GymMaraError as error:
         raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
 
 
 def described(simulation: Simulation, normalisation: Normalisation | None) -> PolicyDescription:
     """The description of a policy that was trained in a simulation, with actions in [-1, 1]."""
     return PolicyDescription(
-        format=1,
+        format=2,
         joints=list(simulation.robot.joint_names),
         low=simulation.action_space.low.tolist(),
         high=simulation.action_space.high.tolist(),
@@ -154,7 +261,16 @@ def described(simulation: Simulation, normalisation: Normalisation | None) -> Po
         normalisation=normalisation,
         robot=fingerprint(simulation.robot),
         versions=versions(),
+        action=_action(simulation),
+        control_period=simulation.backend.control_period,
     )
+
+
+def _action(simulation: Simulation) -> ActionDescription:
+    actions = simulation.actions
+    reference: Any = actions.settings.action_from
+    mode: Any = actions.mode
+    return ActionDescription(mode, actions.steps.tolist(), reference)
 
 
 def _layout(simulation: Simulation) -> list[ObservationPart]:

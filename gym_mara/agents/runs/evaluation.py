@@ -1,14 +1,13 @@
-"""Evaluates a policy over whole episodes: position error, angle, rewards and collisions."""
+"""Plays a run's deterministic policy: step by step, or over many episodes that are measured."""
 
 from __future__ import annotations
 
 import math
+from types import TracebackType
 from typing import Any
 
-import numpy as np
-from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv
-
+from gym_mara.agents.evaluation.episodes import arms_of_a_batch, episode_seeds, play_episodes
+from gym_mara.agents.evaluation.rollout import Act
 from gym_mara.agents.runs.config import check_options
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.runs.policy import load_policy
@@ -16,18 +15,19 @@ from gym_mara.agents.sb3 import MaraVecEnv, require_numpy
 from gym_mara.agents.scaling import unit_box
 from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
-from gym_mara.errors import GymMaraError
+from gym_mara.envs.outcome import Outcome
+from gym_mara.envs.simulation import Simulation
+from gym_mara.registration import environment
 from gym_mara.robot import RobotModel
 from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats
 
-METRICS = ("position_error_mm", "angle_deg", "reward_per_step", "return", "collisions")
-
-MOST_EPISODES = 100_000
 _OTHER_ROBOT = {*ROBOT_KEYWORDS} - {"package_dirs"}
 """The keyword arguments that make another robot; `package_dirs` only says where its files are."""
 RANDOM_EPISODES = 5
 """How many episodes judge a policy where they are random: as many as in Stable-Baselines3's `EvalCallback`."""
+VELOCITY_LIMIT = "max_joint_velocity"
+"""The setting with which joints travel that would else teleport."""
 
 
 def make_arms(
@@ -49,7 +49,7 @@ def make_env(
 ) -> MaraVecEnv:
     """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
     arms = make_arms(env, backend, num_envs, options, **limit)
-    return MaraVecEnv(arms, unit_box(arms.simulation.robot.num_joints))
+    return MaraVecEnv(arms, unit_box(len(arms.simulation.action_space.low)))
 
 
 def episodes_to_judge(config: RunConfig) -> int:
@@ -61,11 +61,91 @@ def episodes_to_judge(config: RunConfig) -> int:
         env.close()
 
 
+class Player:
+    """A run's deterministic policy on N arms of one backend, at the start of episodes without a time limit.
+
+    Use it in a `with` statement.
+
+    Args:
+        run: the run.
+        backend: the backend.
+        options: keyword arguments of the environment, from `options_on`.
+        which: the policy, "last" or "best".
+        arms: N.
+
+    Raises:
+        GymMaraError: the policy is missing, damaged or of another environment or robot, or an option is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        run: RunFolder,
+        backend: str,
+        options: dict[str, Any],
+        *,
+        which: str = "last",
+        arms: int = 1,
+    ) -> None:
+        config = run.config
+        self.policy = load_policy(run, which)
+        self.episode_steps = environment(config.env).max_episode_steps
+        """The length of an episode, steps."""
+        self.options = self.policy.about.keywords(backend, options)
+        """The keyword arguments of the environment, with the policy's action mode and steps."""
+        self.env = make_arms(config.env, backend, arms, self.options, max_episode_steps=None)
+        try:
+            self.policy.check(self.env.simulation, any_robot=chose_robot(options))
+            self._observation, _ = self.env.reset(seed=episode_seeds(0, 0, arms))
+        except BaseException:
+            self.env.close()
+            raise
+
+    def act(self, observation: Floats) -> Floats:
+        """The actions (N, A) for observations (N, O)."""
+        return self.policy.predict(observation)[0]
+
+    def step(self) -> Outcome:
+        """Let the policy act for one step; the outcome holds the state that the task judged."""
+        self._observation, *_ = self.env.step(self.act(self._observation))
+        outcome = self.env.simulation.outcome
+        assert outcome is not None
+        return outcome
+
+    def begin(self, simulation: Simulation) -> Act:
+        """What acts in the episodes of an evaluation."""
+        return self.act
+
+    @property
+    def velocity_limit(self) -> float | None:
+        """If the joints teleport, the value of VELOCITY_LIMIT with which they travel: the robot's lowest velocity limit, rad/s.
+
+        None if they do not teleport, or if the backend or the robot has no limit.
+        """
+        simulation = self.env.simulation
+        lowest = float(simulation.robot.velocity_limit.min())
+        limited = VELOCITY_LIMIT in backend_settings(simulation.backend_name)
+        if simulation.backend.teleports and limited and 0.0 < lowest < math.inf:
+            return lowest
+        return None
+
+    def __enter__(self) -> Player:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.env.close()
+
+
 def evaluate_run(
     run: RunFolder,
     *,
     backend: str | None = None,
     episodes: int = 10,
+    seed: int = 0,
     which: str = "last",
     options: dict[str, Any] | None = None,
 ) -> dict[str, Floats]:
@@ -75,31 +155,31 @@ def evaluate_run(
         run: the run.
         backend: the backend to play on; by default the one that the run was trained on.
         episodes: the number of episodes.
+        seed: of the evaluation; an episode depends on it and on the episode's number alone (`episode_seeds`).
         which: the policy, "last" or "best".
         options: keyword arguments of the environment, in addition to those of the run.
 
     Returns:
-        Each of METRICS per episode (episodes,); position error and angle are those of the last step.
+        Each of METRICS per episode (episodes,); see `gym_mara.agents.evaluation.metrics.measure`.
 
     Raises:
         GymMaraError: the policy is missing, damaged, or of another environment or robot; episodes is out of its range; or
             an option is unknown.
     """
-    if not 1 <= episodes <= MOST_EPISODES:
-        raise GymMaraError(
-            f"episodes must be at least 1 and at most {MOST_EPISODES}, not {episodes}"
-        )
-    config = run.config
-    policy = load_policy(run, which)
-    backend = backend or config.backend
-    settings = options_on(backend, config, options)
-    env = MaraVecEnv(make_arms(config.env, backend, episodes, settings))
-    try:
-        policy.check(env.env.simulation, any_robot=chose_robot(settings))
-        env.seed(config.seed)
-        return play(policy, env)
-    finally:
-        env.close()
+    backend = backend or run.config.backend
+    settings = options_on(backend, run.config, options)
+    return measure_run(run, backend, settings, episodes=episodes, seed=seed, which=which)[0]
+
+
+def measure_run(
+    run: RunFolder, backend: str, options: dict[str, Any], *, episodes: int, seed: int, which: str
+) -> tuple[dict[str, Floats], float | None]:
+    """As `evaluate_run`, with complete options; also returns the player's `velocity_limit`."""
+    arms = arms_of_a_batch(episodes, environment(run.config.env).max_episode_steps)
+    with Player(run, backend, options, which=which, arms=arms) as player:
+        steps, limit = player.episode_steps, player.velocity_limit
+        played = play_episodes(player.env, player.begin, steps=steps, episodes=episodes, seed=seed)
+    return played, limit
 
 
 def options_on(
@@ -141,39 +221,3 @@ def options_beyond_backend(config: RunConfig) -> dict[str, Any]:
     """The keyword arguments of a run's environment, without the settings of its backend."""
     own = backend_settings(config.backend)
     return {name: value for name, value in config.env_options.items() if name not in own}
-
-
-def play(policy: PolicyPredictor, env: VecEnv) -> dict[str, Floats]:
-    """Play one episode per arm with the deterministic policy; returns METRICS, each (N,)."""
-    results: list[dict[str, Any] | None] = [None] * env.num_envs
-    observation: Any = env.reset()
-    while any(result is None for result in results):
-        action, _ = policy.predict(observation, deterministic=True)
-        observation, _, done, infos = env.step(action)
-        for index in np.flatnonzero(done):
-            results[index] = results[index] or infos[index]
-    finished = [result for result in results if result is not None]
-    columns = (
-        [1000.0 * r.get("position_error", np.nan) for r in finished],
-        [np.degrees(r.get("angle_error", np.nan)) for r in finished],
-        [r["ep_rew_mean"] for r in finished],
-        [r["episode"]["r"] for r in finished],
-        [r["num_coll"] for r in finished],
-    )
-    return {name: np.array(column, float) for name, column in zip(METRICS, columns, strict=True)}
-
-
-def spread(metrics: dict[str, Floats]) -> dict[str, dict[str, float] | None]:
-    """Mean, standard deviation, minimum and maximum of each metric over the episodes that have a value; None if none has."""
-    return {name: _spread(values[~np.isnan(values)]) for name, values in metrics.items()}
-
-
-def _spread(values: Floats) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    return {
-        "mean": float(values.mean()),
-        "std": float(values.std()),
-        "min": float(values.min()),
-        "max": float(values.max()),
-    }

@@ -33,14 +33,14 @@ from gym_mara.agents.scaling import Scaling, unit_box
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, replace_folder, write_json, writing
-from gym_mara.types import Floats
+from gym_mara.types import Floats, UnitActions
 
 
 class Policy:
-    """A trained policy: it observes the environment, and acts with joint targets.
+    """A trained policy: it observes the environment and returns an action of it.
 
     It has the `predict` of Stable-Baselines3's policies, so that `evaluate_policy` takes it. Scaling of actions and
-    normalisation of observations are inside.
+    normalisation of observations are inside. `about.action.keywords` makes an environment whose actions mean the same.
     """
 
     def __init__(self, network: BasePolicy, about: PolicyDescription) -> None:
@@ -61,7 +61,10 @@ class Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Floats, None]:
-        """The joint targets (J,) or (N, J), rad, for an observation (O,) or a batch (N, O) of the environment.
+        """The action (A,) for an observation (O,) of the environment, or the actions (N, A) for a batch (N, O).
+
+        Those of a policy that was trained with absolute actions are joint targets, rad; others are UnitActions, which an
+        environment of joint targets refuses.
 
         Args:
             observation: as the environment returns it, not normalised.
@@ -90,7 +93,9 @@ class Policy:
             raise DamagedRunError(f"the policy cannot compute an action: {error}") from error
         if not np.isfinite(actions).all():
             raise DamagedRunError("the policy's action is not finite: its weights are damaged")
-        return self._scaling.targets(actions), None
+        scaled = self._scaling.targets(actions)
+        absolute = self.about.action.mode == "absolute"
+        return (scaled if absolute else scaled.view(UnitActions)), None
 
     def _checked(self, observation: Any, size: int) -> Floats:
         try:
@@ -142,12 +147,18 @@ def read_policy(folder: Path, preset: Preset) -> Policy:
         space = Dict({name: _box(size) for name, size in about.groups.items()})
     try:
         weights = read_weights(folder / "model.zip")
-        network = make_network(preset, space, unit_box(len(about.joints)))
+        network = make_network(preset, space, unit_box(len(about.low)))
         network.load_state_dict(weights)
     except (DamagedFileError, TypeError, ValueError, RuntimeError) as error:
         raise DamagedRunError(f"the policy in {str(folder)!r} is damaged: {error}") from error
     network.set_training_mode(False)
     return Policy(network, about)
+
+
+def policy_of(model: BaseAlgorithm) -> Policy:
+    """The policy of a model in training, as it would be loaded after `save_policy`."""
+    about = described(base_env(model).env.simulation, _statistics(model))
+    return Policy(model.policy, about)
 
 
 def _box(size: int) -> Box:

@@ -7,15 +7,17 @@ from collections.abc import Callable
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
 
-from gym_mara.agents.runs.evaluation import episodes_to_judge, make_env, play
+from gym_mara.agents.evaluation.episodes import MOST_SEED, play_episodes
+from gym_mara.agents.evaluation.metrics import spread
+from gym_mara.agents.runs.evaluation import episodes_to_judge, make_arms
 from gym_mara.agents.runs.folder import RunFolder
-from gym_mara.agents.runs.policy import base_env, normalisation, save_policy
-from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.agents.runs.policy import base_env, policy_of, save_policy
 from gym_mara.agents.training.checkpoint import Progress, state_files
 from gym_mara.agents.training.learning_curve import plot_learning_curve
 from gym_mara.agents.training.replay import remove_replay
+from gym_mara.envs import MaraVectorEnv
+from gym_mara.registration import environment
 
 OnProgress = Callable[[int, dict[str, float]], None]
 """Called with the number of steps so far and the values to show."""
@@ -45,14 +47,16 @@ class CheckpointCallback(BaseCallback):
         self._next = 0
         self._recorded = 0
         """The steps up to which rewards are recorded."""
-        self._eval_env: MaraVecEnv | None = None
+        self._eval_env: MaraVectorEnv | None = None
 
     def _on_training_start(self) -> None:
         self._recorded = self.num_timesteps
         self._next = self.num_timesteps + self.run.config.checkpoint_every
         config = self.run.config
         episodes = episodes_to_judge(config)
-        self._eval_env = make_env(config.env, config.backend, episodes, config.env_options)
+        self._eval_env = make_arms(
+            config.env, config.backend, episodes, config.env_options, max_episode_steps=None
+        )
 
     def _on_rollout_start(self) -> None:
         # The model's own count: Stable-Baselines3 updates the callback's only during the rollout.
@@ -112,16 +116,15 @@ class CheckpointCallback(BaseCallback):
         remove_replay(self.run.checkpoints()[:-1])
 
     def _evaluate(self) -> dict[str, float]:
-        trained = normalisation(self.model)
+        """The mean of each metric that an episode has, of the policy as it is saved."""
         assert self._eval_env is not None
-        env = VecNormalize(
+        policy = policy_of(self.model)
+        config = self.run.config
+        metrics = play_episodes(
             self._eval_env,
-            training=False,
-            norm_obs=trained.norm_obs,
-            norm_reward=False,
-            clip_obs=trained.clip_obs,
+            lambda _: lambda observation: policy.predict(observation)[0],
+            steps=environment(config.env).max_episode_steps,
+            episodes=self._eval_env.num_envs,
+            seed=MOST_SEED + 1 + config.seed,  # the same episodes in every evaluation
         )
-        if trained.norm_obs:
-            env.obs_rms = trained.obs_rms
-        env.seed(self.run.config.seed)  # random episodes are the same in every evaluation
-        return {name: float(values.mean()) for name, values in play(self.model, env).items()}
+        return {name: each["mean"] for name, each in spread(metrics).items() if each}

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from gym_mara.backends.warp.exchange import NumpyExchange
 
 ARRAYS = ("numpy", "torch")
+SERVO_GAIN = 10.0
+"""The gain of servos with dynamics, 1/s: that of the other dynamic backends."""
 OF_MODEL = frozenset(("mass", "effort_limit", "joint_friction", "contact_friction"))
 """The parameters that the model on the device has; the servos and the sensors have the others."""
 _UNLIMITED = 1.0
@@ -46,8 +48,8 @@ class WarpBackend(Backend):
     """Thousands of arms on one GPU, in single precision.
 
     With dynamics the motors are position servos, as those of the backends "dart" and "mujoco". Without, joints move as in
-    the backend "pinocchio": they reach their targets within a step, or with `max_joint_velocity` they travel, and an arm
-    stops where its path first collides.
+    the backend "pinocchio": they reach their targets within a step, or with `max_joint_velocity` they travel, or with
+    `servo_gain` they follow the law of the servos, and an arm stops where its path first collides.
 
     The same arms on the CPU compute the same numbers to the bit. On a GPU MuJoCo Warp adds up the forces of constraints in
     the order in which its threads happen to end, so that two runs differ by rounding.
@@ -58,9 +60,9 @@ class WarpBackend(Backend):
         control_period: s.
         dynamics: whether masses and forces count; False for kinematics with collisions, which is faster.
         physics_step: s; a control period is a whole number of them.
-        max_joint_velocity: rad/s (m/s), where it is below the URDF's limits. None for those; without dynamics, for joints
-            that reach their targets within a step.
-        servo_gain: 1/s.
+        max_joint_velocity: rad/s (m/s), where it is below the URDF's limits. None for those; without dynamics and
+            `servo_gain`, for joints that reach their targets within a step.
+        servo_gain: 1/s. None for SERVO_GAIN; without dynamics, for joints without servos.
         on_divergence: what follows when an arm's state diverges: "error", or "truncate" to end the arm's episode.
         arrays: "numpy", or "torch" for tensors on the device, whose values are never copied to the host. Contacts are not
             reported then, and on a GPU an error may come a few steps late.
@@ -87,7 +89,7 @@ class WarpBackend(Backend):
         dynamics: bool = True,
         physics_step: float = 0.002,
         max_joint_velocity: float | None = None,
-        servo_gain: float = 10.0,
+        servo_gain: float | None = None,
         on_divergence: str = "error",
         arrays: str = "numpy",
         device: str | None = None,
@@ -112,7 +114,9 @@ class WarpBackend(Backend):
         self.arrays = one_of("arrays", arrays, ARRAYS)
         self._max_contacts = whole_number("max_contacts", max_contacts, at_most=1000)
         self._physics_step = positive_number("physics_step", physics_step, "s")
-        self._servo_gain = positive_number("servo_gain", servo_gain, "1/s")
+        if self.dynamic or servo_gain is not None:
+            gain = SERVO_GAIN if servo_gain is None else servo_gain
+            self.servo_gain = positive_number("servo_gain", gain, "1/s")
         self.overshoot = 0.01
         if max_joint_velocity is not None:
             self.joint_velocity = limited_velocity(robot, max_joint_velocity)
@@ -121,9 +125,16 @@ class WarpBackend(Backend):
         else:
             # Limits in single precision may be this much beyond those of the robot.
             self.overshoot = float(np.spacing(np.float32(np.abs([robot.lower, robot.upper]).max())))
-            self.teleports = max_joint_velocity is None
-            limit = self.joint_velocity
-            self.joint_velocity = np.where(limit < LARGEST, limit, _UNLIMITED)
+            self.teleports = max_joint_velocity is None and servo_gain is None
+            if not self.teleports:
+                self.joint_velocity = limited_velocity(robot, max_joint_velocity)
+            unlimited = self.joint_velocity >= LARGEST
+            if servo_gain is not None and unlimited.any():
+                raise GymMaraError(
+                    f"joint {robot.joint_names[int(unlimited.argmax())]} of {robot.name} has no velocity limit, which its servo "
+                    "needs without dynamics: give max_joint_velocity"
+                )
+            self.joint_velocity = np.where(unlimited, _UNLIMITED, self.joint_velocity)
         self.randomisation = Randomisation({} if randomisation is None else randomisation, robot)
         self.random = bool(self.randomisation.ranges)
         if self.random and not self.dynamic:
@@ -169,6 +180,7 @@ class WarpBackend(Backend):
                 late_periods=late_periods(self.randomisation, self.control_period),
                 joint_velocity=self.joint_velocity,
                 teleports=self.teleports,
+                servo_gain=None if self.dynamic else self.servo_gain,
                 max_contacts=self._max_contacts,
                 by_pair=self.arrays == "numpy",
                 own_parameters=not OF_MODEL.isdisjoint(self.randomisation.ranges),
@@ -196,7 +208,7 @@ class WarpBackend(Backend):
         latency = own.get("latency", np.zeros(self.num_envs))
         late = latency // self.control_period
         with self._exchange.scope():
-            engine.gain.assign(self._servo_gain * own.get("servo_gain", ones))
+            engine.gain.assign((self.servo_gain or 0.0) * own.get("servo_gain", ones))
             engine.late.assign(late.astype(np.int32))
             engine.change.assign(latency - late * self.control_period)
             if engine.parameters is None:

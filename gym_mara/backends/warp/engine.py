@@ -43,6 +43,7 @@ class Engine:
         late_periods: the longest latency of a target, whole control periods.
         joint_velocity: the highest (J,), rad/s (m/s).
         teleports: whether arms without dynamics reach their targets at once.
+        servo_gain: that of arms without dynamics, 1/s; None for joints without servos.
         max_contacts: the room for contacts of each arm.
         by_pair: whether contacts are noted for each pair of links.
         own_parameters: whether each arm has physical parameters of its own.
@@ -62,6 +63,7 @@ class Engine:
         late_periods: int,
         joint_velocity: Floats,
         teleports: bool,
+        servo_gain: float | None,
         max_contacts: int,
         by_pair: bool,
         own_parameters: bool,
@@ -71,6 +73,7 @@ class Engine:
         self._physics_step = control_period if physics_step is None else physics_step
         self._steps = round(control_period / self._physics_step)
         self._period = control_period
+        self._gain = 0.0 if servo_gain is None else servo_gain
         model = warp_model(robot, self._physics_step)
         self._rows = model.neq + model.nv + model.ntendon
         rows = self._rows + model.njnt + _ROWS_OF_CONTACT * max_contacts
@@ -217,14 +220,17 @@ class Engine:
         """Move along the paths of one period without dynamics, and look for collisions on them."""
         qpos, furthest = self.data.qpos, self._furthest
         path, samples = [self._start_q, self.target], [self._samples, self._stopped]
-        self._over_arms(paths.plan_path, [*path, furthest, self._reach, PATH_RESOLUTION, *samples])
+        initial = self._gain * self._period or 1.0
+        planned = [furthest, self._reach, initial, PATH_RESOLUTION, *samples]
+        self._over_arms(paths.plan_path, [*path, *planned])
+        law = [furthest, self._velocity, self._gain, self._period]
         for sample in range(1, self._most_samples + 1):
             moved = [self._samples, sample, self._stopped, *self._followers, qpos]
-            self._over_arms(paths.travel, [*path, furthest, *moved])
+            self._over_arms(paths.travel, [*path, *law, *moved])
             self._find_contacts()
             self._over_arms(paths.stop, [self.hit, self._touching, self._stopped])
         ended = [self.hit, self._stopped, qpos, self.data.qvel, self._touching, self.steps]
-        self._over_arms(paths.arrive, [*path, self._velocity, *ended])
+        self._over_arms(paths.arrive, [*path, self._velocity, self._gain, *ended])
 
     def put_at_rest(self) -> None:
         """Put the arms of `mask` at rest at `target`."""

@@ -29,7 +29,7 @@ _ZERO = wp.constant(ZERO)
 
 
 @wp.func
-def _servo_motion(way: float, gain: float, limit: float, time: float) -> float:
+def servo_motion(way: float, gain: float, limit: float, time: float) -> float:
     """How far a joint has moved: `gym_mara.backends.servo_motion.servo_motion` for a number."""
     distance = wp.abs(way)
     slow_way = wp.min(distance, limit / gain)
@@ -43,9 +43,9 @@ def _late_servo_motion(
     q: float, old: float, new: float, gain: float, limit: float, time: float, change: float
 ) -> float:
     """`gym_mara.backends.servo_motion.late_servo_motion` for numbers."""
-    before = _servo_motion(old - q, gain, limit, wp.min(time, change))
+    before = servo_motion(old - q, gain, limit, wp.min(time, change))
     after = wp.max(time - change, 0.0)
-    return before + _servo_motion(new - (q + before), gain, limit, after)
+    return before + servo_motion(new - (q + before), gain, limit, after)
 
 
 @wp.kernel(enable_backward=False)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from gym_mara.agents.evaluation.metrics import METRICS
 from gym_mara.agents.experiments.figures import _scale, plot_grid
 from gym_mara.agents.experiments.grid import Grid, Metrics, open_grid, read_result, valid_result
-from gym_mara.agents.runs.evaluation import METRICS
 from gym_mara.errors import GymMaraError
 
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096)
@@ -111,8 +111,8 @@ def test_a_damaged_result_is_named_and_never_averaged(
         plot_grid(folder)
 
 
-def test_the_form_of_a_result_has_every_metric(folder: Path) -> None:
-    assert Metrics.__annotations__.keys() == set(METRICS)
+def test_a_result_has_metrics_of_the_evaluation(folder: Path) -> None:
+    assert Metrics.__annotations__.keys() <= METRICS.keys()
     assert read_result(folder / "MARA-v0_ppo_0") == RESULT
 
 

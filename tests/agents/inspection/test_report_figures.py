@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gym_mara.agents.inspection.report_figures import Episode, path
-from gym_mara.agents.inspection.rollout import Trajectory
+from tests.agents.evaluation.conftest import trajectory
 from tests.helpers import Floats
 
 STEPS = 40
@@ -16,12 +16,7 @@ PLOTLY_SPREAD = 2.5
 
 def episode(backend: str, tool: Floats) -> Episode:
     """An episode of one arm whose tool takes this path (T, 3), m."""
-    unused = np.zeros((len(tool), 1))
-    joints = np.zeros((len(tool), 1, 6))
-    played = Trajectory(
-        0.02, joints, joints, joints, tool[:, None], unused, unused, unused, unused > 0.0
-    )
-    return Episode(backend, played)
+    return Episode(backend, trajectory(tool=tool[:, None]))
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-4, 0.3, 2.0])

@@ -1,4 +1,4 @@
-"""The actions of an arm: joint targets."""
+"""Checks of the arrays that are given as actions."""
 
 from __future__ import annotations
 
@@ -6,27 +6,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gym_mara.arrays import is_tensor
 from gym_mara.errors import GymMaraError
-from gym_mara.robot import RobotModel
-from gym_mara.robot.joint_ranges import action_range
 from gym_mara.types import Array, UnitActions
 
 
-def action_space(robot: RobotModel) -> Box[np.float32]:
-    """The space of an arm's actions (J,): joint targets, in the range of `action_range`."""
-    low, high = action_range(robot)
-    return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-
-
-def joint_targets(action: Any) -> NDArray[Any]:
+def action_array(action: Any, meaning: str, *, units: bool) -> NDArray[Any]:
     """Return an action as an array of integers or floats.
 
+    Args:
+        action: the action.
+        meaning: what its numbers are, for messages.
+        units: whether it may hold the `UnitActions` of a policy.
+
     Raises:
-        GymMaraError: it has another type, is masked, or holds the `UnitActions` of a policy.
+        GymMaraError: it has another type, is masked, or holds UnitActions that are not allowed.
     """
     if type(action) is np.ndarray:
         array = action
@@ -37,15 +33,16 @@ def joint_targets(action: Any) -> NDArray[Any]:
                 "action.cpu().numpy(), or choose a backend that has arrays='torch'"
             )
         for value in (action, *action) if isinstance(action, Sequence) else (action,):
-            if isinstance(value, UnitActions):
+            if isinstance(value, UnitActions) and not units:
                 raise GymMaraError(
                     "these actions are in [-1, 1], as the policy was trained; wrap the environment in "
                     "gymnasium.wrappers.RescaleAction(env, -1, 1), or play the policy with "
-                    "gym_mara.agents.runs.load_policy"
+                    "gym_mara.agents.runs.load_policy; a policy of relative or cartesian actions needs an environment with the "
+                    "same action=…"
                 )
             if isinstance(value, np.ma.MaskedArray):
                 raise GymMaraError(
-                    "an action cannot be a masked array, because each joint needs a target; give an array without a mask"
+                    "an action cannot be a masked array, because every number is needed; give an array without a mask"
                 )
         try:
             array = np.asarray(action)
@@ -53,13 +50,15 @@ def joint_targets(action: Any) -> NDArray[Any]:
             raise GymMaraError(f"an action must be an array of numbers: {error}") from error
     if array.dtype.kind not in "fiu":
         raise GymMaraError(
-            f"an action must be an array of integers or floats (joint targets, rad), not of {array.dtype}"
+            f"an action must be an array of integers or floats ({meaning}), not of {array.dtype}"
         )
     return array
 
 
-def tensor_targets(action: Any, like: Array) -> Array:
+def action_tensor(action: Any, meaning: str, like: Array) -> Array:
     """Return an action, which must be a tensor of floats on the device of another tensor, in the float type of that one.
+
+    `meaning` says what its numbers are, for messages.
 
     Raises:
         GymMaraError: it is an array of another library, on another device, or not of floats.
@@ -76,6 +75,6 @@ def tensor_targets(action: Any, like: Array) -> Array:
         )
     if not action.is_floating_point():
         raise GymMaraError(
-            f"an action must be a tensor of floats (joint targets, rad), not of {action.dtype}: give actions.float()"
+            f"an action must be a tensor of floats ({meaning}), not of {action.dtype}: give actions.float()"
         )
     return action.detach().to(like.dtype)

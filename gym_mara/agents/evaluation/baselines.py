@@ -1,0 +1,120 @@
+"""Baselines that need no training, in the same episodes and measured in the same way as a policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gym_mara.agents.evaluation.episodes import arms_of_a_batch, play_episodes
+from gym_mara.agents.evaluation.rollout import Begin
+from gym_mara.agents.runs.evaluation import make_arms
+from gym_mara.envs.actions import AbsoluteActions, RelativeActions
+from gym_mara.envs.simulation import Simulation
+from gym_mara.errors import GymMaraError, one_of
+from gym_mara.registration import environment
+from gym_mara.robot.inverse_kinematics import solve_ik
+from gym_mara.types import Floats
+
+
+class StraightMove:
+    """Inverse kinematics, then a straight joint move at the joints' velocity limits; it sees no obstacle.
+
+    The configuration of each target is the one that the search finds from the start configuration, or from elsewhere if that
+    search fails (`solve_ik`). In 60 random poses of MARA that move took 11 % longer, on average, than that to the nearest of
+    25 solutions, which would take ten times as long to compute. All joints arrive together: the slowest moves at its limit.
+    The move knows the true joint positions, also where sensors are noisy.
+
+    Args:
+        simulation: N arms at the start of their episodes.
+
+    Raises:
+        GymMaraError: the task has no pose to reach, or the actions are not those of joints.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        task, robot, backend = simulation.task, simulation.robot, simulation.backend
+        actions, state = simulation.actions, backend.state
+        if not isinstance(actions, (AbsoluteActions, RelativeActions)):
+            raise GymMaraError(
+                f"a straight joint move has no {actions.mode} actions: give action=relative or action=absolute"
+            )
+        state.fill_actions(actions.action, actions.last_action)
+        if "position_error" not in simulation.rewards(state)[1]:
+            raise GymMaraError(
+                f"inverse kinematics needs a task with a pose to reach, and the info of {type(task).__name__} has no "
+                "position_error: choose another --env, or evaluate a trained policy"
+            )
+        goal, orientation = simulation.goal, getattr(task, "orientation", False)
+        self._simulation = simulation
+        self._goal = np.array(
+            [
+                solve_ik(robot, position, quaternion if orientation else None, q)
+                for position, quaternion, q in zip(
+                    goal.position,
+                    goal.quaternion,
+                    state.q.clip(robot.lower, robot.upper),
+                    strict=True,
+                )
+            ]
+        )
+        # How far ahead of a joint its target must be for the joint to move at its limit in the next period.
+        gain = backend.servo_gain
+        lead = backend.control_period + (0.0 if gain is None else 1.0 / gain)
+        self._reach = backend.joint_velocity * lead
+
+    def __call__(self, observation: Any) -> Floats:
+        """The actions (N, J) of the next step."""
+        q, actions = self._simulation.backend.state.q, self._simulation.actions
+        way = self._goal - q
+        target = q + way / np.maximum(_most(way, self._reach), 1.0)
+        if not isinstance(actions, RelativeActions):
+            return target
+        step, scale = target - actions.origin, actions.steps
+        step = step / np.maximum(_most(step, scale), 1.0)
+        return np.divide(step, scale, out=np.zeros_like(step), where=scale > 0.0)
+
+
+def _most(values: Floats, of: Floats) -> Floats:
+    """The largest ratio of an arm's values (N, J) to those of its joints that are not zero (J,), as a column (N, 1)."""
+    ratio = np.divide(np.abs(values), of, out=np.zeros_like(values), where=of > 0.0)
+    return ratio.max(axis=1, keepdims=True)
+
+
+BASELINES: dict[str, Begin] = {"ik": StraightMove}
+"""The baselines by name."""
+
+
+def evaluate_baseline(
+    name: str,
+    env: str,
+    *,
+    backend: str,
+    episodes: int = 10,
+    seed: int = 0,
+    options: dict[str, Any] | None = None,
+) -> dict[str, Floats]:
+    """Play the episodes that `evaluate_run` plays with the same arguments, with a baseline.
+
+    Args:
+        name: one of BASELINES.
+        env: the name of the environment.
+        backend: the name of the backend.
+        episodes: the number of episodes.
+        seed: of the evaluation.
+        options: keyword arguments of the environment.
+
+    Returns:
+        Each of METRICS per episode (episodes,).
+
+    Raises:
+        GymMaraError: the baseline cannot act in this environment, a name is unknown, or a value is out of its range.
+    """
+    begin = BASELINES[one_of("baseline", name, BASELINES)]
+    steps = environment(env).max_episode_steps
+    count = arms_of_a_batch(episodes, steps)
+    arms = make_arms(env, backend, count, options or {}, max_episode_steps=None)
+    try:
+        return play_episodes(arms, begin, steps=steps, episodes=episodes, seed=seed)
+    finally:
+        arms.close()
