@@ -344,7 +344,9 @@ def test_options_have_the_same_names_in_every_command() -> None:
                 shared.setdefault(parameter.name, set()).add(parameter.opts[0])
     shared.pop("out_folder"), shared.pop("out_file")
     for name, spellings in shared.items():
-        expected = {"settings": "--set", "as_json": "--json"}.get(name, f"--{name}")
+        expected = {"settings": "--set", "as_json": "--json", "start": "--from"}.get(
+            name, f"--{name}"
+        )
         assert spellings == {expected.replace("_", "-")}
     for name in ("--envs", "--algos", "--backends", "--policies", "--trial"):
         assert not any(name in p.opts for c in commands.values() for p in c.params)

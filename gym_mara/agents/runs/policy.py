@@ -54,6 +54,11 @@ class Policy:
             self._mean, self._clip = np.array(normalisation.mean), normalisation.clip
             self._deviation = np.sqrt(np.array(normalisation.var) + normalisation.epsilon)
 
+    @property
+    def network(self) -> BasePolicy:
+        """The network of Stable-Baselines3, whose actions are in [-1, 1]."""
+        return self._network
+
     def predict(
         self,
         observation: ArrayLike | dict[str, NDArray[Any]],

@@ -51,8 +51,10 @@ class CheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._recorded = self.num_timesteps
-        self._next = self.num_timesteps + self.run.config.checkpoint_every
         config = self.run.config
+        self._next = self.num_timesteps + config.checkpoint_every
+        if config.start is not None and not self.run.checkpoints():
+            self._next = 0  # the policy of the other run is evaluated, and kept here
         episodes = episodes_to_judge(config)
         self._eval_env = make_arms(
             config.env, config.backend, episodes, config.env_options, max_episode_steps=None

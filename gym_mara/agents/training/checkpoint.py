@@ -79,14 +79,14 @@ def state_files(model: BaseAlgorithm, progress: Progress) -> dict[str, list[Buff
     if isinstance(model, OffPolicyAlgorithm):
         files[REPLAY_FILE] = replay_contents(buffer_of(model))
         state["off_policy"] = {
-            "variables": _plain(_variables(model)),
+            "variables": _plain(variables_of(model)),
             "warm_up": model.action_space.np_random,
             "replay": replay_state(buffer_of(model)),
         }
     return {STATE_FILE: [encode(state)], **files}
 
 
-def _variables(model: OffPolicyAlgorithm) -> dict[str, torch.Tensor]:
+def variables_of(model: OffPolicyAlgorithm) -> dict[str, torch.Tensor]:
     """The tensors that a model learns beside its networks, such as the entropy coefficient."""
     _, names = model._get_torch_save_params()
     return {name: getattr(model, name) for name in names}
@@ -154,7 +154,7 @@ def _check(model: BaseAlgorithm, state: Any) -> None:
     }
     if isinstance(model, OffPolicyAlgorithm):
         form["off_policy"] = {
-            "variables": dict.fromkeys(_variables(model), torch.Tensor),
+            "variables": dict.fromkeys(variables_of(model), torch.Tensor),
             "warm_up": np.random.Generator,
             "replay": replay_state(buffer_of(model)),
         }
@@ -190,7 +190,7 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any]) -> Progress:
 @torch.no_grad()
 def _restore_off_policy(model: OffPolicyAlgorithm, state: dict[str, Any], checkpoint: Path) -> None:
     """Restore what only off-policy algorithms have: tensors beside the networks, and the replay buffer."""
-    for name, variable in _variables(model).items():
+    for name, variable in variables_of(model).items():
         variable.copy_(state["variables"][name])
     model.action_space._np_random = state["warm_up"]  # random actions before the first update
     read_replay(checkpoint / REPLAY_FILE, buffer_of(model), state["replay"])

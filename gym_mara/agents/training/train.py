@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
+from gym_mara.agents.algorithms.off_policy import WarmUp
 from gym_mara.agents.algorithms.registry import (
     DEFAULT_ALGORITHM,
     DEFAULT_PRESET,
@@ -37,6 +38,7 @@ from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
 from gym_mara.agents.training.replay import hindsight
+from gym_mara.agents.training.warm_start import begin_with
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from gym_mara.files import DamagedFileError, locked, refuse_links
@@ -60,6 +62,12 @@ def train(
     algorithm(config.algo)  # an unknown name is an error before anything is built
     config = replace(config, preset=asdict(preset or preset_of(config)))
     model = new_model(config)  # if this fails, no folder is made
+    if config.start is not None:
+        try:
+            begin_with(model, config)
+        except BaseException:
+            base_env(model).close()
+            raise
     run = RunFolder.create(out, config)
     with _locked(run):
         return _learn(run, model, on_progress)
@@ -105,6 +113,11 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
         raise GymMaraError(
             f"the run {str(run.path)!r} has finished its {config.steps} steps; start a new run to train longer"
         )
+    if config.start is not None and not checkpoints:
+        raise DamagedRunError(
+            f"the run {str(run.path)!r} ended before it had stored the policy with which it starts: start a new run with "
+            f"--from {config.start.run}"
+        )
     model = new_model(config)
     try:
         reached = restore_state(model, checkpoints[-1]) if checkpoints else _NOTHING
@@ -129,10 +142,13 @@ def new_model(config: RunConfig) -> BaseAlgorithm:
     preset = config.made_preset()
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     try:
-        return new_agent(config.algo, preset, env, config.seed)
+        model = new_agent(config.algo, preset, env, config.seed)
     except BaseException:
         env.close()
         raise
+    if isinstance(model, WarmUp):
+        model.policy_is_trained = config.start is not None
+    return model
 
 
 def preset_agent(

@@ -16,7 +16,7 @@ _TELEPORTING = Preset(
         "gamma": 0.0,
         "ent_coef": "auto_0.01",
         "learning_rate": 1e-3,
-        "policy_kwargs": {"net_arch": [64, 64]},
+        "policy_kwargs": {"net_arch": [128, 128]},
     },
 )
 _TRAVELLING = Preset(
@@ -39,7 +39,7 @@ _TRAVELLING = Preset(
 ALGORITHM = Algorithm(
     name="tqc",
     summary="truncated quantile critics, from sb3-contrib",
-    target="sb3_contrib:TQC",
+    target="gym_mara.agents.algorithms.off_policy:TQC",
     presets={"tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING)},
     search_space=SearchSpace(
         arguments={
