@@ -91,7 +91,7 @@ def test_a_tuned_policy_acts_the_same_in_a_run_on_travelling_joints(
     for each in (policy, other):
         torch.manual_seed(0)
         random.append(each.predict(seen, deterministic=False)[0])
-    np.testing.assert_allclose(*random, atol=1e-5)
+    np.testing.assert_allclose(random[0], random[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("algo", ["sac", "tqc"])
@@ -176,10 +176,11 @@ def test_the_statistics_of_the_observations_are_taken_over(tmp_path: Path) -> No
     asked = replace(started_from(run), preset=asdict(preset))
     model = new_model(asked)
     begin_with(model, asked)
-    about, statistics = load_policy(run).about.normalisation, normalisation(model).obs_rms
+    about = load_policy(run).about.normalisation
+    statistics: Any = normalisation(model).obs_rms
     assert about is not None
-    np.testing.assert_array_equal(statistics.mean, about.mean)  # type: ignore[union-attr]
-    assert statistics.count == 2 * ROLLOUT  # type: ignore[union-attr]
+    np.testing.assert_array_equal(statistics.mean, about.mean)
+    assert statistics.count == 2 * ROLLOUT
     seen = observations(20)
     np.testing.assert_array_equal(
         policy_of(model).predict(seen)[0], load_policy(run).predict(seen)[0]
