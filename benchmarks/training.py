@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from idle_vec_env import IdleVecEnv
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.runs.evaluation import make_env
@@ -33,7 +33,7 @@ def training_ratio(name: str, task: str = "MARACollisionOrient-v0") -> str:
     )
 
 
-def _learn(model: OnPolicyAlgorithm, steps: int) -> float:
+def _learn(model: BaseAlgorithm, steps: int) -> float:
     start = time.perf_counter()
     model.learn(steps, reset_num_timesteps=False)
     return time.perf_counter() - start
@@ -65,10 +65,12 @@ def print_dynamic_training() -> None:
 
 
 def update_costs(batch: int = 2048) -> dict[str, float]:
-    """The time of an update of each algorithm on a batch of the same size, ms: the shortest of several turns."""
-    models = {}
+    """The time of an update of each on-policy algorithm on a batch of the same size, ms: the shortest of several turns."""
+    models: dict[str, Any] = {}
     for algo in ALGORITHMS:
         preset = algorithm(algo).preset("tuned", teleports=True)
+        if "n_steps" not in preset.arguments:
+            continue  # an off-policy algorithm learns from its replay buffer, not from a batch of steps
         steps = batch // preset.num_envs
         preset = replace(preset, arguments={**preset.arguments, "n_steps": steps})
         env = make_env("MARACollisionOrient-v0", "pinocchio", preset.num_envs, {})

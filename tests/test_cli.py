@@ -240,7 +240,7 @@ def test_an_option_of_rewards_without_effect_is_an_error(
     ("arguments", "message"),
     [
         (["train", "--env", "MARA-v1"], "Did you mean 'MARA-v0'"),
-        (["train", "--algo", "sac"], "unknown algorithm 'sac'"),
+        (["train", "--algo", "a3c"], "unknown algorithm 'a3c'"),
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
         (["train", "--steps", "nan"], "'--steps': must be a whole number"),
@@ -344,7 +344,9 @@ def test_options_have_the_same_names_in_every_command() -> None:
                 shared.setdefault(parameter.name, set()).add(parameter.opts[0])
     shared.pop("out_folder"), shared.pop("out_file")
     for name, spellings in shared.items():
-        expected = {"settings": "--set", "as_json": "--json"}.get(name, f"--{name}")
+        expected = {"settings": "--set", "as_json": "--json", "start": "--from"}.get(
+            name, f"--{name}"
+        )
         assert spellings == {expected.replace("_", "-")}
     for name in ("--envs", "--algos", "--backends", "--policies", "--trial"):
         assert not any(name in p.opts for c in commands.values() for p in c.params)

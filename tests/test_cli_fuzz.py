@@ -123,6 +123,8 @@ VALID: dict[str, Sequence[str]] = {
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
     "policy": ["last", "best"],
+    "start": ["run"],
+    "from_policy": ["last", "best"],
     "preset": preset_names(),
     "executor": ["local"],
     "steps": ["1", "300"],

@@ -165,6 +165,8 @@ class MaraVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the batch once; the list repeats its result for each arm. `render` gives each arm its picture.
 
+        `compute_reward` of a goal environment changes nothing, so it may be called for some arms: HerReplayBuffer does so.
+
         Raises:
             GymMaraError: the indices leave out arms.
         """
@@ -172,8 +174,9 @@ class MaraVecEnv(VecEnv):
         if method_name == "render":
             pictures = self.get_images()
             return [pictures[index] for index in chosen]
-        self._check_all(chosen, f"call {method_name!r}")
-        return [getattr(self.env, method_name)(*method_args, **method_kwargs)] * self.num_envs
+        if method_name != "compute_reward":
+            self._check_all(chosen, f"call {method_name!r}")
+        return [getattr(self.env, method_name)(*method_args, **method_kwargs)] * len(chosen)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Whether the arms behave as in this wrapper: true for Monitor, since the info has its `episode`."""

@@ -1,31 +1,22 @@
-"""gym-mara train, evaluate, transfer and export: the commands for one run."""
+"""gym-mara evaluate, transfer and export: the commands for the policy of a run."""
 
 from __future__ import annotations
 
 import json
-import shlex
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from datetime import datetime
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich import box
 from rich.table import Column, Table
 
-from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
-    AlgoOption,
-    BackendOption,
-    CheckpointOption,
     EnvOption,
     PolicyOption,
-    PresetOption,
     RunBackendOption,
     SetOption,
-    StepsOption,
     backend_name,
     interruptible,
     keyword_arguments,
@@ -38,7 +29,6 @@ from gym_mara.cli.common import (
     whole,
 )
 from gym_mara.errors import GymMaraError
-from gym_mara.registration import file_name
 from gym_mara.types import Floats
 
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
@@ -64,74 +54,6 @@ def _baselines() -> Iterable[str]:
     with needs_agents():
         from gym_mara.agents.evaluation.baselines import BASELINES
     return BASELINES
-
-
-def train(
-    context: typer.Context,
-    env: EnvOption = "MARA-v0",
-    algo: AlgoOption = DEFAULT_ALGORITHM,
-    backend: BackendOption = DEFAULT_BACKEND,
-    steps: StepsOption = 1_000_000,
-    seed: Annotated[
-        int,
-        typer.Option(
-            parser=whole(0, 2**32 - 1),
-            metavar="N",
-            help="Seed of the policy, the sampling and the environment.",
-        ),
-    ] = 0,
-    out_folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="New run folder; by default a folder in runs/ named after the run and the time.",
-        ),
-    ] = None,
-    preset: PresetOption = DEFAULT_PRESET,
-    checkpoint_every: CheckpointOption = 50_000,
-    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
-    resume: Annotated[
-        Path | None,
-        typer.Option(help="Resume this run from its last checkpoint, with its own options."),
-    ] = None,
-) -> None:
-    """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log. Needs the extra train."""
-    with needs_agents():
-        from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
-        from gym_mara.agents.runs.folder import RunConfig, RunFolder
-        from gym_mara.agents.training.train import resume as resume_training
-        from gym_mara.agents.training.train import train as start_training
-
-    if resume is not None:
-        others = (p.name or "" for p in context.command.params if p.name != "resume")
-        refuse(context, "--resume uses the options of the run", *others)
-        interrupted = RunFolder.open(resume)
-        if not interrupted.checkpoints():
-            out.print("The run has no checkpoint: it starts from the beginning.", soft_wrap=True)
-        with _progress(interrupted.config.steps, resume) as on_progress:
-            run = resume_training(resume, on_progress)
-    else:
-        config = RunConfig(
-            env=env,
-            algo=algo,
-            backend=backend,
-            steps=steps,
-            seed=seed,
-            checkpoint_every=checkpoint_every,
-            preset_name=preset,
-            env_options=keyword_arguments(settings),
-        )
-        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = (
-            out_folder or Path("runs") / f"{algo}_{file_name(env)}_{backend}_seed{seed}_{stamp}"
-        )
-        with _progress(config.steps, folder) as on_progress:
-            run = start_training(config, folder, on_progress)
-    metrics = evaluate_run(run, episodes=episodes_to_judge(run.config))
-    _print_metrics(f"{run.config.env} on {run.config.backend}, last policy", metrics)
-    if (trained := run.trained_steps()) > run.config.steps:
-        out.print(f"Trained {trained:,} steps: an update needs a whole rollout of all arms.")
-    out.print(f"Run folder: {run.path}", soft_wrap=True)
 
 
 def evaluate(
@@ -185,7 +107,7 @@ def evaluate(
     if as_json:
         print(json.dumps(spread(metrics), indent=2))
     else:
-        _print_metrics(f"{env} on {backend}, {who}, seed {seed}", metrics)
+        print_metrics(f"{env} on {backend}, {who}, seed {seed}", metrics)
 
 
 def transfer(
@@ -248,54 +170,7 @@ def export(
     out.print(f"{file}: {about.action.mode} actions for {about.robot.name}", soft_wrap=True)
 
 
-@contextmanager
-def _progress(total: int, run: Path) -> Iterator[Any]:
-    """A progress bar, updated by the function that this yields; after an interrupt it says what is kept."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.completed:>9,.0f} / {task.total:,.0f} steps"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
-    bar = Progress(*columns, console=out)
-    task = bar.add_task("", total=total)
-
-    with interruptible(lambda: _kept(run)):
-
-        def on_progress(steps: int, shown: dict[str, float]) -> None:
-            bar.start()  # not before the training has started: an error before shows no bar
-            text = f"reward {shown['reward_per_step']:6.2f}" if "reward_per_step" in shown else ""
-            if "eval_position_error_mm" in shown:
-                text += f"   evaluated: {shown['eval_position_error_mm']:.1f} mm"
-            bar.update(task, completed=min(steps, total), description=text)
-
-        try:
-            yield on_progress
-        finally:
-            if bar.live.is_started:
-                bar.stop()
-
-
-def _kept(path: Path) -> str:
-    """What an interrupted training has left in its folder, and how to resume it."""
-    from gym_mara.agents.runs.folder import RunFolder
-
-    try:
-        run = RunFolder.open(path)
-    except GymMaraError:
-        return "Interrupted. Nothing was saved."
-    checkpoints = run.checkpoints()
-    kept = (
-        f"The checkpoint at step {int(checkpoints[-1].name):,} is kept; resume"
-        if checkpoints
-        else "There is no checkpoint yet; start again from the beginning"
-    )
-    return f"Interrupted. {kept} with gym-mara train --resume {shlex.quote(str(path))}"
-
-
-def _print_metrics(title: str, metrics: dict[str, Floats]) -> None:
+def print_metrics(title: str, metrics: dict[str, Floats]) -> None:
     """The statistics of each metric in a table of at most 80 columns."""
     from gym_mara.agents.evaluation.metrics import METRICS, STATISTICS, statistics_in_short
 

@@ -8,7 +8,7 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from gym_mara.cli import FAILED, agents, environments, experiments, robots, viewing
+from gym_mara.cli import FAILED, agents, environments, experiments, robots, training, viewing
 from gym_mara.cli.common import err, interruptible
 from gym_mara.errors import GymMaraError
 
@@ -32,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(agents.train)
+app.command()(training.train)
 app.command()(agents.evaluate)
 app.command()(agents.transfer)
 app.command()(agents.export)

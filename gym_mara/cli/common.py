@@ -198,6 +198,12 @@ def interruptible(message: str | Callable[[], str]) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
+def is_given(context: typer.Context, name: str) -> bool:
+    """Whether a parameter of the command was given on the command line."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def refuse(context: typer.Context, reason: str, *names: str) -> None:
     """Refuse options that would have no effect.
 
@@ -209,12 +215,11 @@ def refuse(context: typer.Context, reason: str, *names: str) -> None:
     Raises:
         GymMaraError: one of them was given on the command line.
     """
-    given = []
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        source = context.get_parameter_source(name)
-        if (name in names or not names) and source is not None and source.name == "COMMANDLINE":
-            given.append(parameter.opts[0])
+    given = [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if (parameter.name in names or not names) and is_given(context, parameter.name or "")
+    ]
     if given:
         raise GymMaraError(f"{reason}: leave out {', '.join(given)}")
 

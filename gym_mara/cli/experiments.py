@@ -72,7 +72,7 @@ def benchmark(
         typer.Option(
             parser=several(algorithm_name),
             metavar="NAMES",
-            help="Algorithms, separated by commas; by default all that have the preset.",
+            help="Algorithms, separated by commas; by default the paper's that have the preset.",
         ),
     ] = None,
     seeds: SeedsOption = 3,
@@ -110,7 +110,7 @@ def benchmark(
 
     grid = Grid(
         envs=names_in("--env", env),
-        algos=names_in("--algo", algo) if algo else _all_algorithms(preset),
+        algos=names_in("--algo", algo) if algo else _paper_algorithms(preset),
         seeds=seeds,
         steps=steps,
         preset_name=preset,
@@ -138,9 +138,11 @@ def benchmark(
         )
 
 
-def _all_algorithms(preset: str) -> tuple[str, ...]:
-    """The algorithms that have a preset."""
-    return tuple(name for name, entry in ALGORITHMS.items() if preset in entry.presets)
+def _paper_algorithms(preset: str) -> tuple[str, ...]:
+    """The algorithms of ROS2Learn that have a preset."""
+    return tuple(
+        name for name, entry in ALGORITHMS.items() if {"paper", preset} <= {*entry.presets}
+    )
 
 
 def plot(folder: Annotated[Path, typer.Argument(help="The folder of a benchmark.")]) -> None:

@@ -105,13 +105,18 @@ class GoalSimulation(Simulation):
             reward = self._dense(achieved, desired, state.collided)
         return reward, terms | {"is_success": success}
 
+    @property
+    def reward_needs_info(self) -> bool:
+        """Whether `compute_reward` reads the info of each step: only then does the reward depend on collisions."""
+        return self._settings.reward_type == "dense" and self._reach.collision_penalty
+
     def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
         """The rewards of goals, as in MaraGoalEnv."""
         if self._settings.reward_type == "sparse":
             return self._sparse(self._succeeds(achieved, desired), achieved)
         rows = (-1, achieved.shape[-1])
         collided: Mask = np.zeros(math.prod(achieved.shape[:-1]), np.bool_)
-        if self._reach.collision_penalty:
+        if self.reward_needs_info:
             infos = [info] if isinstance(info, Mapping) else list(info)
             if not all("collided" in one for one in infos):
                 raise GymMaraError(

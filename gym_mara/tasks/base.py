@@ -70,6 +70,8 @@ class Task(ABC):
 
     random_goal: ClassVar[bool] = False
     """Whether `draw_goal` draws a new goal for each episode."""
+    preset_family: ClassVar[str] = ""
+    """The family of tasks for which an algorithm may have presets of its own; see docs/add_an_algorithm.md."""
 
     default_action: ClassVar[str] = "absolute"
     """The action mode of the environments unless the keyword argument `action` chooses one."""

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import math
 import pkgutil
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeGuard
 
 from gym_mara.errors import GymMaraError, short, unknown
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from gym_mara.agents.algorithms.unit_policy import MarksUnitActions
 
 POLICY_FORMS = {
     "mlp": "gym_mara.agents.algorithms.unit_policy:MlpPolicy",
     "natural": "gym_mara.agents.algorithms.natural_gaussian:NaturalGaussianPolicy",
+    "sac": "gym_mara.agents.algorithms.squashed_policy:SquashedPolicy",
+    "tqc": "gym_mara.agents.algorithms.squashed_policy:SquashedQuantilePolicy",
 }
 """The policy networks by name, each as "module:Class", imported when first used."""
+_WITH_Q = ("sac", "tqc")
+"""The networks whose critics are functions of state and action."""
 
 
-def policy_class(form: str) -> type[ActorCriticPolicy]:
+def policy_class(form: str) -> type[MarksUnitActions]:
     """The class of the policy network of this name.
 
     Raises:
@@ -49,7 +56,8 @@ class Preset:
     """Keyword arguments of the algorithm's class, as plain values.
 
     A value that changes during the run is a tuple of points (progress, value), connected by straight lines; the progress
-    goes from 0 to 1. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`.
+    goes from 0 to 1. `ent_coef` of SAC and TQC may be "auto" or "auto_" with its first value. In `policy_kwargs`, `optimizer_class` is the name of a class in `torch.optim`, and `activation_fn`
+    is one of ACTIVATIONS.
     """
     normalise_observation: bool = False
     normalise_reward: bool = False
@@ -65,8 +73,15 @@ class Preset:
                 f"a preset has 1 to {_MOST_ARMS} arms, and at most {_LARGEST_ROLLOUT} steps in a rollout, "
                 f"not {short(self.num_envs)} arms with {short(steps)} steps each"
             )
+        size = self.arguments.get("buffer_size", 1)
+        if type(size) is not int or not 1 <= size <= _LARGEST_BUFFER:
+            raise GymMaraError(
+                f"buffer_size must be a whole number from 1 to {_LARGEST_BUFFER:,}, not {short(size)}"
+            )
         policy = self.arguments.get("policy_kwargs", {})
         others = {name: v for name, v in self.arguments.items() if name != "policy_kwargs"}
+        if isinstance(start := others.get("ent_coef"), str) and _LEARNT.fullmatch(start):
+            del others["ent_coef"]
         for name, value in others.items():
             points = value if is_schedule(value) else [(0.0, value)]
             if any(len(point) != 2 for point in points) or not all(
@@ -75,26 +90,33 @@ class Preset:
                 raise GymMaraError(
                     f"the argument {name!r} must be a number or points (progress, value), not {short(value)}"
                 )
-        _check_policy(policy)
+        _check_policy(policy, "qf" if self.policy in _WITH_Q else "vf")
 
 
 _MOST_ARMS = 2**16
 _LARGEST_ROLLOUT = 2**22
+_LARGEST_BUFFER = 2**21
+_LEARNT = re.compile(r"auto(_(0\.[0-9]*[1-9]|[1-9][0-9]*(\.[0-9]+)?))?")
+"""An entropy coefficient that is learnt, with or without its first value."""
 _LARGEST_WHOLE = 10**12
 _NETWORK = (6, 1024)
 """The most layers of a network, and the most units of a layer."""
+ACTIVATIONS = ("ReLU", "Tanh", "ELU", "SiLU", "GELU", "LeakyReLU")
+"""The activation functions of a network, each a class in `torch.nn`."""
 _POLICY_NUMBERS = ("log_std_init", "ortho_init", "covariance_rate", "bias_rate", "widening")
+_POLICY_COUNTS = {"n_critics": 8, "n_quantiles": 128}
+"""The whole numbers among the arguments of a network, each with its largest value."""
 
 
-def _check_policy(values: Any) -> None:
-    """Raises GymMaraError if the arguments of a policy network are not valid."""
+def _check_policy(values: Any, critic: str) -> None:
+    """Raises GymMaraError if the arguments of a policy network are not valid; `critic` is the name of its critic."""
     if not isinstance(values, dict):
         raise GymMaraError(f"policy_kwargs must be a dict, not {short(values)}")
     layers, units = _NETWORK
     for name, value in values.items():
         if name == "net_arch":
             nets = list(value.values()) if isinstance(value, dict) else [value]
-            if (isinstance(value, dict) and set(value) - {"pi", "vf"}) or not all(
+            if (isinstance(value, dict) and set(value) - {"pi", critic}) or not all(
                 isinstance(net, (list, tuple))
                 and len(net) <= layers
                 and all(type(size) is int and 1 <= size <= units for size in net)
@@ -102,15 +124,29 @@ def _check_policy(values: Any) -> None:
             ):
                 raise GymMaraError(
                     f"net_arch must be a list of at most {layers} sizes from 1 to {units}, or such lists "
-                    f"by the names 'pi' and 'vf', not {short(value)}"
+                    f"by the names 'pi' and {critic!r}, not {short(value)}"
                 )
+        elif name == "activation_fn":
+            if value not in ACTIVATIONS:
+                raise unknown("activation function", value, ACTIVATIONS)
         elif name == "optimizer_class":
             if not isinstance(value, str) or not value.isidentifier():
                 raise GymMaraError(
                     f"optimizer_class must be the name of an optimiser, not {short(value)}"
                 )
+        elif name in _POLICY_COUNTS:
+            if type(value) is not int or not 1 <= value <= _POLICY_COUNTS[name]:
+                raise GymMaraError(
+                    f"{name} must be a whole number from 1 to {_POLICY_COUNTS[name]}, not {short(value)}"
+                )
         elif name not in _POLICY_NUMBERS:
-            valid = ["net_arch", "optimizer_class", *_POLICY_NUMBERS]
+            valid = [
+                "net_arch",
+                "activation_fn",
+                "optimizer_class",
+                *_POLICY_COUNTS,
+                *_POLICY_NUMBERS,
+            ]
             raise unknown("argument of the policy", name, valid)
         elif not _is_number(value):
             raise GymMaraError(f"{name} must be a finite number, not {short(value)}")
@@ -152,13 +188,19 @@ def is_schedule(value: Any) -> TypeGuard[Sequence[Sequence[float]]]:
     return isinstance(value, (tuple, list)) and bool(value) and isinstance(value[0], (tuple, list))
 
 
-class PresetPair(NamedTuple):
-    """The presets of one name for the two ways in which a backend moves the joints."""
+class Presets(NamedTuple):
+    """The presets of one name, for the ways in which a backend moves the joints and for families of tasks."""
 
     teleporting: Preset
     """For joints that are at their targets after one step."""
     travelling: Preset
     """For joints that need several steps to reach their targets."""
+    families: Mapping[str, Preset] = MappingProxyType({})
+    """`Task.preset_family` → the preset for these tasks on every backend; the two above are for all other tasks."""
+
+    def choose(self, *, teleports: bool, family: str = "") -> Preset:
+        """The preset for a backend whose joints teleport, or travel, and a family of tasks."""
+        return self.families.get(family) or (self.teleporting if teleports else self.travelling)
 
 
 class LogRange(NamedTuple):
@@ -184,7 +226,7 @@ class SearchSpace:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An on-policy algorithm in the form of Stable-Baselines3."""
+    """An on-policy or off-policy algorithm in the form of Stable-Baselines3."""
 
     name: str
     """Its name in `--algo`; figures and tables print it in capitals."""
@@ -192,15 +234,15 @@ class Algorithm:
     """What it is, in a few words, for `gym-mara list`."""
     target: str
     """The class as "module:Class", imported when first used."""
-    presets: Mapping[str, PresetPair]
+    presets: Mapping[str, Presets]
     """Name → presets; "tuned" is the default and must be among them."""
     search_space: SearchSpace
 
-    def load_class(self) -> type[OnPolicyAlgorithm]:
+    def load_class(self) -> type[BaseAlgorithm]:
         """The algorithm's class, its module imported."""
         return pkgutil.resolve_name(self.target)
 
-    def preset_pair(self, name: str) -> PresetPair:
+    def presets_of(self, name: str) -> Presets:
         """The presets of this name.
 
         Raises:
@@ -210,11 +252,10 @@ class Algorithm:
             raise unknown("preset", name, self.presets, f" of the algorithm {self.name!r}")
         return self.presets[name]
 
-    def preset(self, name: str, *, teleports: bool) -> Preset:
-        """The preset of this name for a backend whose joints teleport, or travel.
+    def preset(self, name: str, *, teleports: bool, family: str = "") -> Preset:
+        """The preset of this name for a backend whose joints teleport, or travel, and a family of tasks.
 
         Raises:
             GymMaraError: the algorithm has no such preset.
         """
-        pair = self.preset_pair(name)
-        return pair.teleporting if teleports else pair.travelling
+        return self.presets_of(name).choose(teleports=teleports, family=family)

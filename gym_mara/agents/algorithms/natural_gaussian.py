@@ -209,6 +209,14 @@ class NaturalGaussianPolicy(MarksUnitActions, ActorCriticPolicy):
         self._mean_sum, self._count = self._mean_sum + mean.sum(dim=0), self._count + len(mean)
         return result
 
+    @torch.no_grad()
+    def take_over(self, other: NaturalGaussianPolicy) -> None:  # type: ignore[override]
+        """Become the policy of another network of the same size, whatever its rates are."""
+        super().take_over(other)
+        self.factor.copy_(self.factor @ torch.matrix_exp(other._symmetric_log_scale()))
+        self.log_scale.zero_()
+        self.action_net.bias.mul_(other.bias_rate / self.bias_rate)
+
     def set_training_mode(self, mode: bool) -> None:
         """Stable-Baselines3 calls it with True before an update, and with False before the policy only acts."""
         if mode and self._count:

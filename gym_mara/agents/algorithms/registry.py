@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gym_mara.agents.algorithms.base import Algorithm
-from gym_mara.agents.algorithms.entries import acktr, ppo, trpo
+from gym_mara.agents.algorithms.entries import acktr, ppo, sac, tqc, trpo
 from gym_mara.errors import unknown
 
 ALGORITHMS: dict[str, Algorithm] = {
@@ -12,6 +12,8 @@ ALGORITHMS: dict[str, Algorithm] = {
         ppo.ALGORITHM,
         trpo.ALGORITHM,
         acktr.ALGORITHM,
+        sac.ALGORITHM,
+        tqc.ALGORITHM,
     )
 }
 DEFAULT_ALGORITHM = "ppo"

@@ -18,6 +18,10 @@ class MarksUnitActions(BasePolicy):
         actions, state = super().predict(*args, **kwargs)
         return (actions.view(UnitActions) if is_unit_box(self.action_space) else actions), state
 
+    def take_over(self, other: BasePolicy) -> None:
+        """Become the policy of another network of the same form and size."""
+        self.load_state_dict(other.state_dict())
+
 
 class MlpPolicy(MarksUnitActions, ActorCriticPolicy):
     """The ActorCriticPolicy of Stable-Baselines3, its actions marked."""

@@ -68,7 +68,7 @@ class Grid:
             if env not in environment_names():
                 raise unknown("environment", env, environment_names())
         for algo in self.algos:
-            algorithm(algo).preset_pair(self.preset_name)
+            algorithm(algo).presets_of(self.preset_name)
         if self.backend not in backend_names():
             raise unknown("backend", self.backend, backend_names())
         for kind, names in (("environment", self.envs), ("algorithm", self.algos)):
@@ -177,11 +177,12 @@ def read_grid(folder: Path) -> Grid:
 
 def _presets(grid: Grid) -> dict[str, Any]:
     """A grid's presets as they are now, as JSON values."""
-    pairs = {algo: algorithm(algo).preset_pair(grid.preset_name) for algo in grid.algos}
-    return {
-        algo: tuple(json.loads(json.dumps(asdict(preset))) for preset in pair)
-        for algo, pair in pairs.items()
-    }
+    found = {}
+    for algo in grid.algos:
+        teleporting, travelling, families = algorithm(algo).presets_of(grid.preset_name)
+        each = [teleporting, travelling, *(families[family] for family in sorted(families))]
+        found[algo] = tuple(json.loads(json.dumps(asdict(preset))) for preset in each)
+    return found
 
 
 def _read(folder: Path) -> _GridFile:

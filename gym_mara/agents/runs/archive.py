@@ -27,18 +27,17 @@ _TENSORS = {
 _IMPORTS = {"GLOBAL", "INST", "STACK_GLOBAL", "EXT1", "EXT2", "EXT4"}
 
 
-def read_weights(file: Path) -> dict[str, torch.Tensor]:
-    """The weights of the policy in a model.zip, by name.
+def read_weights(file: Path, member: str = "policy.pth") -> dict[str, torch.Tensor]:
+    """The weights of the policy in a model.zip, by name, or the tensors in another member of it.
 
     Raises:
         DamagedFileError: the file is missing, damaged or too large, or holds anything but finite numbers.
     """
     members = _members(read_bytes(file, LARGEST), str(file))
-    if "policy.pth" not in members:
-        raise DamagedFileError(f"cannot read {str(file)!r}: it has no policy.pth")
-    content = members["policy.pth"]
+    if member not in members:
+        raise DamagedFileError(f"cannot read {str(file)!r}: it has no {member}")
     try:
-        return _tensors(content, f"policy.pth of {file}")
+        return _tensors(members[member], f"{member} of {file}")
     except DamagedFileError:
         raise
     except Exception as error:  # torch raises any exception

@@ -34,6 +34,28 @@ class DamagedRunError(DamagedFileError):
 
 
 @dataclass(frozen=True)
+class Start:
+    """The policy of another run with which a run starts. It is read once: the run does not need the other folder later.
+
+    Raises:
+        GymMaraError: the number of steps is out of its range.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    run: str
+    """The folder of the other run."""
+    policy: str
+    """Which of its policies, "last" or "best"."""
+    steps: int
+    """How many steps the other run had trained."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.steps <= 2 * MOST_STEPS:
+            raise GymMaraError(f"the steps of the start are out of range: {short(self.steps)}")
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """What a run trains. The same configuration with the same versions of the libraries gives the same run.
 
@@ -58,6 +80,8 @@ class RunConfig:
     preset_name: str = DEFAULT_PRESET
     preset: dict[str, Any] = field(default_factory=dict)
     """The values of the preset, so that a later change of the preset does not change the run."""
+    start: Start | None = None
+    """The policy with which the run starts; None for an untrained one."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "checkpoint_every"):

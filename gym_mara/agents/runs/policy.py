@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,11 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecNormalize
+from typing_extensions import Buffer
 
 from gym_mara.agents.algorithms.base import Preset, policy_class
 from gym_mara.agents.runs.archive import read_weights
@@ -41,7 +43,7 @@ class Policy:
     normalisation of observations are inside. `about.action.keywords` makes an environment whose actions mean the same.
     """
 
-    def __init__(self, network: ActorCriticPolicy, about: PolicyDescription) -> None:
+    def __init__(self, network: BasePolicy, about: PolicyDescription) -> None:
         self.about = about
         self._network = network
         low, high = np.array(about.low), np.array(about.high)
@@ -53,7 +55,7 @@ class Policy:
             self._deviation = np.sqrt(np.array(normalisation.var) + normalisation.epsilon)
 
     @property
-    def network(self) -> ActorCriticPolicy:
+    def network(self) -> BasePolicy:
         """The network of Stable-Baselines3, whose actions are in [-1, 1]."""
         return self._network
 
@@ -158,7 +160,7 @@ def read_policy(folder: Path, preset: Preset) -> Policy:
     return Policy(network, about)
 
 
-def policy_of(model: OnPolicyAlgorithm) -> Policy:
+def policy_of(model: BaseAlgorithm) -> Policy:
     """The policy of a model in training, as it would be loaded after `save_policy`."""
     about = described(base_env(model).env.simulation, _statistics(model))
     return Policy(model.policy, about)
@@ -168,7 +170,7 @@ def _box(size: int) -> Box:
     return Box(-np.inf, np.inf, (size,), np.float64)
 
 
-def make_network(preset: Preset, observation: Space[Any], actions: Box) -> ActorCriticPolicy:
+def make_network(preset: Preset, observation: Space[Any], actions: Box) -> BasePolicy:
     """The untrained policy network of a preset."""
     make = policy_class(preset.policy)
     return make(observation, actions, lambda _: 0.0, **policy_arguments(preset, observation))
@@ -186,15 +188,22 @@ def policy_arguments(preset: Preset, observation: Space[Any]) -> dict[str, Any]:
         if not (isinstance(optimizer, type) and issubclass(optimizer, torch.optim.Optimizer)):
             raise GymMaraError(f"torch.optim has no optimiser {name!r}")
         arguments["optimizer_class"] = optimizer
+    if (name := arguments.get("activation_fn")) is not None:
+        arguments["activation_fn"] = getattr(torch.nn, name)
     if isinstance(observation, Dict):
         arguments["features_extractor_class"] = CombinedExtractor
     return arguments
 
 
 def save_policy(
-    folder: Path, model: OnPolicyAlgorithm, extra: dict[str, bytes] | None = None
+    folder: Path, model: BaseAlgorithm, extra: Mapping[str, Iterable[Buffer]] | None = None
 ) -> None:
-    """Write the folder of a policy, with other files in it; after a kill the folder holds the old policy or the new one.
+    """Write the folder of a policy; after a kill the folder holds the old policy or the new one.
+
+    Args:
+        folder: the folder.
+        model: the agent.
+        extra: other files to write there: name → the pieces of its content.
 
     Raises:
         GymMaraError: the folder cannot be written; then the old policy is unchanged.
@@ -207,14 +216,15 @@ def save_policy(
             model.save(temporary / "model.zip")
             about = described(base_env(model).env.simulation, _statistics(model))
             write_json(temporary / "policy.json", asdict(about))
-            for name, content in (extra or {}).items():
-                (temporary / name).write_bytes(content)
+            for name, pieces in (extra or {}).items():
+                with (temporary / name).open("wb") as stream:
+                    stream.writelines(pieces)
             replace_folder(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _statistics(model: OnPolicyAlgorithm) -> Normalisation | None:
+def _statistics(model: BaseAlgorithm) -> Normalisation | None:
     """How a model's observations are normalised."""
     wrapped = normalisation(model)
     if not wrapped.norm_obs:

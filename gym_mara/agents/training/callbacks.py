@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from gym_mara.agents.evaluation.episodes import MOST_SEED, play_episodes
 from gym_mara.agents.evaluation.metrics import spread
 from gym_mara.agents.runs.evaluation import episodes_to_judge, make_arms
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import base_env, policy_of, save_policy
-from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, encoded_state
+from gym_mara.agents.training.checkpoint import Progress, state_files
 from gym_mara.agents.training.learning_curve import plot_learning_curve
+from gym_mara.agents.training.replay import remove_replay
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.registration import environment
 
 OnProgress = Callable[[int, dict[str, float]], None]
 """Called with the number of steps so far and the values to show."""
+_ROW_EVERY = 2000
+"""The least steps between two rows of the table for an off-policy algorithm, whose rollouts may be a single step."""
 
 
 class CheckpointCallback(BaseCallback):
@@ -42,11 +45,16 @@ class CheckpointCallback(BaseCallback):
         self.on_progress = on_progress
         self.shown: dict[str, float] = {}
         self._next = 0
+        self._recorded = 0
+        """The steps up to which rewards are recorded."""
         self._eval_env: MaraVectorEnv | None = None
 
     def _on_training_start(self) -> None:
-        self._next = self.num_timesteps + self.run.config.checkpoint_every
+        self._recorded = self.num_timesteps
         config = self.run.config
+        self._next = self.num_timesteps + config.checkpoint_every
+        if config.start is not None and not self.run.checkpoints():
+            self._next = 0  # the policy of the other run is evaluated, and kept here
         episodes = episodes_to_judge(config)
         self._eval_env = make_arms(
             config.env, config.backend, episodes, config.env_options, max_episode_steps=None
@@ -62,19 +70,27 @@ class CheckpointCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        model = self.model
-        env = base_env(model)
-        steps = self.model.n_steps * env.num_envs  # type: ignore[attr-defined]
-        self.shown["reward_per_step"] = env.reward_sum / steps
-        env.reward_sum = 0.0
-        self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
+        least = _ROW_EVERY if isinstance(self.model, OffPolicyAlgorithm) else 0
+        if self.model.num_timesteps - self._recorded >= least:
+            self._record_reward()
+            self.model.dump_logs()
         self.on_progress(self.model.num_timesteps, self.shown)
+
+    def _record_reward(self) -> None:
+        """Record the mean reward of the steps since the last record, if there are any."""
+        env = base_env(self.model)
+        steps = self.model.num_timesteps - self._recorded
+        if steps:
+            self.shown["reward_per_step"] = env.reward_sum / steps
+            self.logger.record("rollout/reward_per_step", self.shown["reward_per_step"])
+        self._recorded, env.reward_sum = self.model.num_timesteps, 0.0
 
     def _on_training_end(self) -> None:
         self.checkpoint()
         plot_learning_curve(self.run)
-        # This marks the run as finished, so it comes last.
-        save_policy(self.run.path / "last", self.model)  # type: ignore[arg-type]
+        # This marks the run as finished. A finished run needs no replay buffer.
+        save_policy(self.run.path / "last", self.model)
+        remove_replay(self.run.checkpoints())
 
     def close(self) -> None:
         """Close the environment of the evaluations."""
@@ -83,8 +99,9 @@ class CheckpointCallback(BaseCallback):
 
     def checkpoint(self) -> None:
         """Evaluate, save the policy if it is the best so far, and write a checkpoint."""
-        model: Any = self.model
+        model = self.model
         steps = model.num_timesteps
+        self._record_reward()
         for name, value in self._evaluate().items():
             self.logger.record(f"eval/{name}", value)
             self.shown[f"eval_{name}"] = value
@@ -96,13 +113,14 @@ class CheckpointCallback(BaseCallback):
         if self.shown["eval_reward_per_step"] > self.best:
             self.best = self.shown["eval_reward_per_step"]
             save_policy(self.run.path / "best", model)
-        state = encoded_state(model, Progress(self.best, elapsed))
-        save_policy(self.run.path / "checkpoints" / str(steps), model, {STATE_FILE: state})
+        files = state_files(model, Progress(self.best, elapsed))
+        save_policy(self.run.path / "checkpoints" / str(steps), model, files)
+        remove_replay(self.run.checkpoints()[:-1])
 
     def _evaluate(self) -> dict[str, float]:
         """The mean of each metric that an episode has, of the policy as it is saved."""
         assert self._eval_env is not None
-        policy = policy_of(self.model)  # type: ignore[arg-type]
+        policy = policy_of(self.model)
         config = self.run.config
         metrics = play_episodes(
             self._eval_env,

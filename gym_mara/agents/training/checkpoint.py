@@ -10,14 +10,23 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.spaces import Dict, Space
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from typing_extensions import Buffer
 
 from gym_mara.agents.runs.archive import LARGEST
 from gym_mara.agents.runs.config import DamagedRunError
 from gym_mara.agents.runs.description import read_description
 from gym_mara.agents.runs.policy import base_env, normalisation
 from gym_mara.agents.runs.snapshot import decode, encode
+from gym_mara.agents.training.replay import (
+    REPLAY_FILE,
+    buffer_of,
+    read_replay,
+    replay_contents,
+    replay_state,
+)
 from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, read_bytes
 from gym_mara.snapshots import check_fits
@@ -48,35 +57,46 @@ class Progress(NamedTuple):
     """How long it has trained, s."""
 
 
-def encoded_state(model: OnPolicyAlgorithm, progress: Progress) -> bytes:
-    """The state of a training, before a rollout starts.
+def state_files(model: BaseAlgorithm, progress: Progress) -> dict[str, list[Buffer]]:
+    """The files of a checkpoint with the state of a training, before a rollout starts: name → the pieces of its content.
 
     Raises:
         GymMaraError: the environment's snapshot has a value that is not plain.
     """
     wrapped = normalisation(model)
-    return encode(
-        {
-            "progress": list(progress),
-            "parameters": _plain(model.get_parameters()),
-            "attributes": {name: getattr(model, name) for name in _ATTRIBUTES},
-            "statistics": {
-                name: vars(vars(wrapped)[name]).copy()
-                for name in _STATISTICS
-                if name in vars(wrapped)
-            },
-            "returns": wrapped.returns,
-            "env": base_env(model).save_state(),
-            "random": _random_state(),
+    state = {
+        "progress": list(progress),
+        "parameters": _plain(model.get_parameters()),
+        "attributes": {name: getattr(model, name) for name in _ATTRIBUTES},
+        "statistics": {
+            name: vars(vars(wrapped)[name]).copy() for name in _STATISTICS if name in vars(wrapped)
+        },
+        "returns": wrapped.returns,
+        "env": base_env(model).save_state(),
+        "random": _random_state(),
+    }
+    files: dict[str, list[Buffer]] = {}
+    if isinstance(model, OffPolicyAlgorithm):
+        files[REPLAY_FILE] = replay_contents(buffer_of(model))
+        state["off_policy"] = {
+            "variables": _plain(variables_of(model)),
+            "warm_up": model.action_space.np_random,
+            "replay": replay_state(buffer_of(model)),
         }
-    )
+    return {STATE_FILE: [encode(state)], **files}
 
 
-def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
+def variables_of(model: OffPolicyAlgorithm) -> dict[str, torch.Tensor]:
+    """The tensors that a model learns beside its networks, such as the entropy coefficient."""
+    _, names = model._get_torch_save_params()
+    return {name: getattr(model, name) for name in names}
+
+
+def restore_state(model: BaseAlgorithm, checkpoint: Path) -> Progress:
     """Set an untrained model with its environment, and the random generators, to the state of a checkpoint.
 
     Raises:
-        DamagedRunError: the checkpoint is damaged or of an older version.
+        DamagedRunError: the checkpoint is damaged or of an older version, or has no replay buffer.
         GymMaraError: the robot has changed since.
     """
     read_description(checkpoint).check(base_env(model).env.simulation)
@@ -88,6 +108,8 @@ def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
     try:
         state = decode(read_bytes(checkpoint / STATE_FILE, 4 * LARGEST))
         _check(model, state)
+        if isinstance(model, OffPolicyAlgorithm):
+            _restore_off_policy(model, state["off_policy"], checkpoint)
         return _restore(model, state)
     except (
         DamagedFileError,
@@ -103,7 +125,7 @@ def restore_state(model: OnPolicyAlgorithm, checkpoint: Path) -> Progress:
         ) from error
 
 
-def _check(model: OnPolicyAlgorithm, state: Any) -> None:
+def _check(model: BaseAlgorithm, state: Any) -> None:
     """Check all of a state that the environment and torch do not check themselves.
 
     Raises:
@@ -111,7 +133,7 @@ def _check(model: OnPolicyAlgorithm, state: Any) -> None:
     """
     wrapped = normalisation(model)
     observation = _batch(model.observation_space, wrapped.num_envs)
-    form = {
+    form: dict[str, Any] = {
         "progress": [0.0, 0.0],
         "parameters": dict,
         "attributes": {
@@ -130,6 +152,12 @@ def _check(model: OnPolicyAlgorithm, state: Any) -> None:
         "env": {"env": dict, "returns": wrapped.returns},
         "random": list,
     }
+    if isinstance(model, OffPolicyAlgorithm):
+        form["off_policy"] = {
+            "variables": dict.fromkeys(variables_of(model), torch.Tensor),
+            "warm_up": np.random.Generator,
+            "replay": replay_state(buffer_of(model)),
+        }
     check_fits("state", state, form)
     episodes = state["attributes"]["ep_info_buffer"]
     check_fits("ep_info_buffer", episodes, deque([{"r": 0.0, "l": 0, "t": 0.0}] * len(episodes)))
@@ -145,7 +173,7 @@ def _batch(space: Space[Any], size: int) -> Any:
     return np.zeros((size, *(space.shape or ())))
 
 
-def _restore(model: OnPolicyAlgorithm, state: dict[str, Any]) -> Progress:
+def _restore(model: BaseAlgorithm, state: dict[str, Any]) -> Progress:
     wrapped = normalisation(model)
     model.set_parameters(state["parameters"], exact_match=True, device="cpu")
     for name in _ATTRIBUTES:
@@ -157,6 +185,15 @@ def _restore(model: OnPolicyAlgorithm, state: dict[str, Any]) -> Progress:
     base_env(model).restore_state(state["env"])
     _restore_random_state(state["random"])
     return Progress(*map(float, state["progress"]))
+
+
+@torch.no_grad()
+def _restore_off_policy(model: OffPolicyAlgorithm, state: dict[str, Any], checkpoint: Path) -> None:
+    """Restore what only off-policy algorithms have: tensors beside the networks, and the replay buffer."""
+    for name, variable in variables_of(model).items():
+        variable.copy_(state["variables"][name])
+    model.action_space._np_random = state["warm_up"]  # random actions before the first update
+    read_replay(checkpoint / REPLAY_FILE, buffer_of(model), state["replay"])
 
 
 def _plain(value: Any) -> Any:

@@ -13,17 +13,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Dict
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     KVWriter,
     Logger,
     TensorBoardOutputFormat,
 )
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
+from gym_mara.agents.algorithms.off_policy import WarmUp
 from gym_mara.agents.algorithms.registry import (
     DEFAULT_ALGORITHM,
     DEFAULT_PRESET,
@@ -34,6 +37,8 @@ from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, r
 from gym_mara.agents.runs.policy import base_env, policy_arguments
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
+from gym_mara.agents.training.replay import hindsight
+from gym_mara.agents.training.warm_start import begin_with
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from gym_mara.files import DamagedFileError, locked, refuse_links
@@ -57,24 +62,32 @@ def train(
     algorithm(config.algo)  # an unknown name is an error before anything is built
     config = replace(config, preset=asdict(preset or preset_of(config)))
     model = new_model(config)  # if this fails, no folder is made
+    if config.start is not None:
+        try:
+            begin_with(model, config)
+        except BaseException:
+            base_env(model).close()
+            raise
     run = RunFolder.create(out, config)
     with _locked(run):
         return _learn(run, model, on_progress)
 
 
 def preset_of(config: RunConfig) -> Preset:
-    """The preset that a configuration names, for joints that teleport or travel as they do in its environment.
+    """The preset that a configuration names, for the task and the backend of its environment.
 
     Raises:
         GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
     """
-    pair = algorithm(config.algo).preset_pair(config.preset_name)
+    presets = algorithm(config.algo).presets_of(config.preset_name)
     env = make_env(config.env, config.backend, 1, config.env_options)
     try:
-        teleports = env.env.simulation.backend.teleports
+        simulation = env.env.simulation
+        return presets.choose(
+            teleports=simulation.backend.teleports, family=simulation.task.preset_family
+        )
     finally:
         env.close()
-    return pair.teleporting if teleports else pair.travelling
 
 
 def resume(path: Path, on_progress: OnProgress) -> RunFolder:
@@ -100,6 +113,11 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
         raise GymMaraError(
             f"the run {str(run.path)!r} has finished its {config.steps} steps; start a new run to train longer"
         )
+    if config.start is not None and not checkpoints:
+        raise DamagedRunError(
+            f"the run {str(run.path)!r} ended before it had stored the policy with which it starts: start a new run with "
+            f"--from {config.start.run}"
+        )
     model = new_model(config)
     try:
         reached = restore_state(model, checkpoints[-1]) if checkpoints else _NOTHING
@@ -119,15 +137,18 @@ def _locked(run: RunFolder) -> AbstractContextManager[None]:
     return locked(run.path / ".lock", busy)
 
 
-def new_model(config: RunConfig) -> OnPolicyAlgorithm:
+def new_model(config: RunConfig) -> BaseAlgorithm:
     """An untrained agent and its environment, from a configuration."""
     preset = config.made_preset()
     env = make_env(config.env, config.backend, preset.num_envs, config.env_options)
     try:
-        return new_agent(config.algo, preset, env, config.seed)
+        model = new_agent(config.algo, preset, env, config.seed)
     except BaseException:
         env.close()
         raise
+    if isinstance(model, WarmUp):
+        model.policy_is_trained = config.start is not None
+    return model
 
 
 def preset_agent(
@@ -138,7 +159,7 @@ def preset_agent(
     backend: str = DEFAULT_BACKEND,
     seed: int = 0,
     **options: Any,
-) -> OnPolicyAlgorithm:
+) -> BaseAlgorithm:
     """An untrained agent with the hyperparameters of a preset and its environment, for a script of your own.
 
     Args:
@@ -167,12 +188,18 @@ def preset_agent(
     return new_model(replace(config, preset=asdict(preset_of(config))))
 
 
-def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgorithm:
+def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> BaseAlgorithm:
     """An untrained agent of an algorithm with a preset, on any vector environment of Stable-Baselines3.
 
+    An off-policy algorithm gets hindsight replay where `hindsight` says so.
+
     Raises:
-        GymMaraError: the algorithm does not take an argument of the preset.
+        GymMaraError: the algorithm does not take an argument of the preset, or the preset normalises dictionaries.
     """
+    if preset.normalise_observation and isinstance(env.observation_space, Dict):
+        raise GymMaraError(
+            "a preset with normalise_observation needs observations that are arrays, not dictionaries"
+        )
     use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
@@ -181,6 +208,8 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> OnPolicyAlgo
     arguments["policy_kwargs"] = policy_arguments(preset, env.observation_space)
     policy = policy_class(preset.policy)
     make = algorithm(algo).load_class()
+    if issubclass(make, OffPolicyAlgorithm):
+        arguments |= hindsight(env, preset)
     try:
         return make(policy, wrapped, seed=seed, device="cpu", **arguments)
     except (TypeError, ValueError, AssertionError) as error:
@@ -230,7 +259,7 @@ _UNWRITABLE = {
 
 def _learn(
     run: RunFolder,
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     on_progress: OnProgress,
     reached: Progress = _NOTHING,
 ) -> RunFolder:
@@ -240,7 +269,8 @@ def _learn(
         try:
             on_progress(model.num_timesteps, {})
             left = run.config.steps - model.num_timesteps
-            model.learn(left, callback=callback, reset_num_timesteps=False)
+            # No interval: the callback writes the rows.
+            model.learn(left, callback, log_interval=None, reset_num_timesteps=False)  # type: ignore[arg-type]
         finally:
             model.logger.close()
     except OSError as error:
@@ -265,11 +295,11 @@ def _learn(
     return run
 
 
-def _is_finite(model: OnPolicyAlgorithm) -> bool:
+def _is_finite(model: BaseAlgorithm) -> bool:
     """Whether a model's parameters, its standard deviations and their inverses are finite."""
     numbers: list[torch.Tensor] = list(model.policy.parameters())
-    if hasattr(model.policy, "log_std"):
-        numbers += [model.policy.log_std.exp(), (-model.policy.log_std).exp()]
+    if isinstance(log_std := getattr(model.policy, "log_std", None), torch.Tensor):
+        numbers += [log_std.exp(), (-log_std).exp()]
     return all(bool(each.isfinite().all()) for each in numbers)
 
 

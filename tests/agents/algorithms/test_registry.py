@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from stable_baselines3 import A2C
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from torch import nn
 
 from gym_mara.agents.algorithms.base import (
     POLICY_FORMS,
     Algorithm,
     LogRange,
     Preset,
-    PresetPair,
+    Presets,
     SearchSpace,
     is_schedule,
     policy_class,
@@ -34,8 +38,11 @@ from gym_mara.agents.experiments.grid import Grid, open_grid, run_one
 from gym_mara.agents.experiments.search import Search, best_trial, open_study, run_trials
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
-from gym_mara.agents.training.train import train
+from gym_mara.agents.runs.policy import make_network
+from gym_mara.agents.scaling import unit_box
+from gym_mara.agents.training.train import preset_of, train
 from gym_mara.errors import GymMaraError
+from gym_mara.tasks import TASKS, ReachTask
 from tests.agents.conftest import silent
 
 A2C_ENTRY = Algorithm(
@@ -43,7 +50,7 @@ A2C_ENTRY = Algorithm(
     summary="advantage actor-critic, from Stable-Baselines3",
     target="stable_baselines3:A2C",
     presets={
-        "tuned": PresetPair(
+        "tuned": Presets(
             teleporting=Preset(
                 num_envs=16,
                 arguments={"n_steps": 4, "gamma": 0.0, "learning_rate": ((0.0, 1e-3), (1.0, 0.0))},
@@ -71,7 +78,7 @@ def test_an_entry_is_complete(name: str) -> None:
     assert entry.name == name
     assert entry.summary
     assert DEFAULT_PRESET in entry.presets
-    assert issubclass(entry.load_class(), OnPolicyAlgorithm)
+    assert issubclass(entry.load_class(), (OnPolicyAlgorithm, OffPolicyAlgorithm))
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -112,9 +119,62 @@ def test_the_defaults_are_registered() -> None:
     assert preset_names() == ["tuned", "paper"]
 
 
-def test_a_pair_has_a_preset_for_each_way_of_moving(a2c: Algorithm) -> None:
+def test_there_is_a_preset_for_each_way_of_moving(a2c: Algorithm) -> None:
     assert a2c.preset("tuned", teleports=True).num_envs == 16
     assert a2c.preset("tuned", teleports=False).num_envs == 8
+
+
+@dataclass(frozen=True)
+class TouchTask(ReachTask):
+    """A task of a family that has presets of its own."""
+
+    preset_family: ClassVar[str] = "touch"
+
+
+@pytest.mark.parametrize("options", [{}, {"max_joint_velocity": 1.0}])
+def test_a_family_of_tasks_has_its_own_preset_on_every_backend(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    presets = A2C_ENTRY.presets["tuned"]
+    own = Preset(num_envs=4)
+    entry = replace(A2C_ENTRY, presets={"tuned": presets._replace(families={"touch": own})})
+    monkeypatch.setitem(ALGORITHMS, "a2c", entry)
+    monkeypatch.setitem(TASKS, "MARATouch-v0", TouchTask())
+    assert preset_of(config(env="MARATouch-v0", env_options=options)) is own
+    assert preset_of(config(env_options=options)) in presets[:2]
+
+
+@pytest.mark.usefixtures("a2c")
+def test_a_family_without_its_own_preset_has_that_of_the_backend(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(TASKS, "MARATouch-v0", TouchTask())
+    assert preset_of(config(env="MARATouch-v0")) is A2C_ENTRY.presets["tuned"].teleporting
+
+
+def test_a_changed_preset_of_a_family_is_another_grid(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    grid = Grid(envs=("MARA-v0",), algos=("a2c",), seeds=1, steps=256)
+    for arms in (4, 8):
+        presets = A2C_ENTRY.presets["tuned"]._replace(families={"touch": Preset(num_envs=arms)})
+        monkeypatch.setitem(ALGORITHMS, "a2c", replace(A2C_ENTRY, presets={"tuned": presets}))
+        if arms == 4:
+            open_grid(tmp_path / "grid", grid)
+    with pytest.raises(GymMaraError, match="the 'tuned' presets have changed"):
+        open_grid(tmp_path / "grid", grid)
+
+
+@pytest.mark.parametrize("form", ["mlp", "natural"])
+def test_a_preset_names_the_activation_function(form: str) -> None:
+    arguments = {"policy_kwargs": {"activation_fn": "ELU"}}
+    preset = Preset(num_envs=1, policy=form, arguments=arguments)
+    network = make_network(preset, Box(-1.0, 1.0, (3,)), unit_box(2))
+    kinds = {type(module) for module in network.modules()}
+    assert nn.ELU in kinds
+    assert nn.Tanh not in kinds
+    with pytest.raises(GymMaraError, match=r"unknown activation function 'Elu'.*ELU"):
+        Preset(num_envs=1, arguments={"policy_kwargs": {"activation_fn": "Elu"}})
 
 
 def ignore(message: Any) -> None:

@@ -17,7 +17,7 @@ import pytest
 from gym_mara.agents.runs import load_policy
 from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.agents.runs.policy import base_env
-from gym_mara.agents.training.checkpoint import encoded_state, restore_state
+from gym_mara.agents.training.checkpoint import restore_state, state_files
 from gym_mara.agents.training.train import new_model
 from gym_mara.errors import GymMaraError
 
@@ -149,9 +149,9 @@ def test_a_damaged_checkpoint_is_restored_as_it_was_or_is_an_error(
     model = new_model(finished_run.config)
     last = str(finished_run.checkpoints()[-1].relative_to(finished_run.path))
 
-    def restored(run: RunFolder) -> bytes:
+    def restored(run: RunFolder) -> Any:
         reached = restore_state(model, run.checkpoints()[-1])
-        return encoded_state(model, reached)
+        return state_files(model, reached)
 
     whole, errors = restored(finished_run), 0
     for seed in range(100):

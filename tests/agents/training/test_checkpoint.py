@@ -17,7 +17,7 @@ from gym_mara.agents.runs.config import DamagedRunError
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.runs.policy import base_env, save_policy
 from gym_mara.agents.runs.snapshot import decode, encode
-from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, encoded_state, restore_state
+from gym_mara.agents.training.checkpoint import STATE_FILE, Progress, restore_state, state_files
 from gym_mara.agents.training.train import new_model, preset_of, resume
 from gym_mara.envs.statistics import EpisodeStatistics
 from tests.agents.conftest import config, silent
@@ -38,12 +38,12 @@ def test_a_restored_training_has_the_same_state(tmp_path: Path, algo: str) -> No
     preset = asdict(preset_of(config(algo=algo)))
     model = new_model(config(algo=algo, preset=preset))
     model.learn(600)
-    state = encoded_state(model, REACHED)
-    save_policy(tmp_path / "checkpoint", model, {STATE_FILE: state})
+    files = state_files(model, REACHED)
+    save_policy(tmp_path / "checkpoint", model, files)
     other = new_model(config(algo=algo, preset=preset, seed=9))
-    assert encoded_state(other, REACHED) != state
+    assert state_files(other, REACHED) != files
     assert restore_state(other, tmp_path / "checkpoint") == REACHED
-    assert encoded_state(other, REACHED) == state
+    assert state_files(other, REACHED) == files
     for each in (model, other):
         base_env(each).close()
 

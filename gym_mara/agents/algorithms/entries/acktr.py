@@ -1,6 +1,6 @@
 """ACKTR: its presets and its search space."""
 
-from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, PresetPair, SearchSpace
+from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, Presets, SearchSpace
 from gym_mara.agents.algorithms.entries import PAPER_NETWORK
 
 _TELEPORTING = Preset(
@@ -47,8 +47,8 @@ ALGORITHM = Algorithm(
     summary="actor-critic using Kronecker-factored trust region, our own",
     target="gym_mara.agents.algorithms.acktr:ACKTR",
     presets={
-        "tuned": PresetPair(teleporting=_TELEPORTING, travelling=_TRAVELLING),
-        "paper": PresetPair(teleporting=_PAPER, travelling=_PAPER),
+        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(
         arguments={

@@ -1,6 +1,6 @@
 """PPO: its presets and its search space."""
 
-from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, PresetPair, SearchSpace
+from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, Presets, SearchSpace
 from gym_mara.agents.algorithms.entries import PAPER_NETWORK
 
 # Where joints teleport, the next state depends on the action alone, so future rewards are not discounted in (γ = 0).
@@ -66,8 +66,8 @@ ALGORITHM = Algorithm(
     summary="proximal policy optimisation, from Stable-Baselines3",
     target="stable_baselines3:PPO",
     presets={
-        "tuned": PresetPair(teleporting=_TELEPORTING, travelling=_TRAVELLING),
-        "paper": PresetPair(teleporting=_PAPER, travelling=_PAPER),
+        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(
         arguments={

@@ -1,6 +1,6 @@
 """TRPO: its presets and its search space."""
 
-from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, PresetPair, SearchSpace
+from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, Presets, SearchSpace
 from gym_mara.agents.algorithms.entries import PAPER_NETWORK
 
 # `cg_damping` and `bias_rate` keep the natural gradient from following directions in which few states differ.
@@ -65,8 +65,8 @@ ALGORITHM = Algorithm(
     summary="trust region policy optimisation, from sb3-contrib",
     target="sb3_contrib:TRPO",
     presets={
-        "tuned": PresetPair(teleporting=_TELEPORTING, travelling=_TRAVELLING),
-        "paper": PresetPair(teleporting=_PAPER, travelling=_PAPER),
+        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(
         arguments={
