@@ -46,6 +46,7 @@ class AnyTargetTask(Task):
     default_action: ClassVar[str] = "relative"
     observes_action: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 200
+    preset_family: ClassVar[str] = "any_target"
 
     on_collision: str = "terminate"
     orientation: bool = False

@@ -46,6 +46,21 @@ _TRAVELLING = Preset(
         },
     },
 )
+# Many arms with random targets, and many short updates. An action is rewarded within half a second.
+_ANY_TARGET = Preset(
+    num_envs=512,
+    normalise_observation=True,
+    arguments={
+        "n_steps": 16,
+        "batch_size": 2048,
+        "n_epochs": 5,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "policy_kwargs": {"net_arch": [256, 256], "log_std_init": -1.5, "activation_fn": "ReLU"},
+    },
+)
 _PAPER = Preset(
     num_envs=8,
     arguments={
@@ -66,7 +81,7 @@ ALGORITHM = Algorithm(
     summary="proximal policy optimisation, from Stable-Baselines3",
     target="stable_baselines3:PPO",
     presets={
-        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "tuned": Presets(_TELEPORTING, _TRAVELLING, {"any_target": _ANY_TARGET}),
         "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(
