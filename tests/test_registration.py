@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import NameNotFound
+from gymnasium.spaces import Box
 
 import gym_mara
 from gym_mara.envs import MaraEnv, MaraVectorEnv
@@ -41,7 +42,8 @@ def _run(code: str, folder: Path) -> str:
 
 def test_the_ids_are_registered() -> None:
     registered = {name for name in gymnasium.registry if name.startswith("gym_mara/")}
-    assert registered == {*ENV_IDS, "gym_mara/MARARandomTarget-v0", "gym_mara/MARAGoal-v0"}
+    others = "MARARandomTarget-v0", "MARAGoal-v0", "MARAReach-v0", "MARAPose-v0"
+    assert registered == {*ENV_IDS, *(f"gym_mara/{name}" for name in others)}
 
 
 @pytest.mark.parametrize("name", TASK_NAMES)
@@ -61,6 +63,15 @@ def test_make_vec_creates_the_native_vector_env(name: str) -> None:
     assert env.max_episode_steps == 2048
     assert env.reset()[0].shape[0] == 4
     assert gymnasium.make_vec(name, num_envs=1, max_episode_steps=5).max_episode_steps == 5  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["MARAReach-v0", "MARAPose-v0"])
+def test_the_tasks_for_any_target_have_short_episodes_of_relative_actions(name: str) -> None:
+    env, envs = gymnasium.make(f"gym_mara/{name}"), gymnasium.make_vec(f"gym_mara/{name}", 2)
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == 200
+    assert envs.max_episode_steps == 200  # type: ignore[attr-defined]
+    assert env.action_space == Box(-1.0, 1.0, (6,), np.float32)
 
 
 def test_gymnasiums_sync_and_async_vector_envs_work() -> None:

@@ -84,7 +84,7 @@ class Part:
     name: str
     size: int
     unit: str
-    """Of its values, such as "m/s"; "joint" is the unit of each joint, and "" none."""
+    """Of its values, such as "m/s"; "joint" is the unit of each joint, "joint/s" that of its velocity, and "" none."""
     input: str
     """The model's input that it belongs to, in which the parts follow each other in the order of the list."""
 

@@ -10,7 +10,7 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from gym_mara.snapshots import check_fits
-from gym_mara.tasks import Draw, Task, Workspace
+from gym_mara.tasks import Task, Workspace
 from gym_mara.types import Floats, Mask
 
 
@@ -50,7 +50,7 @@ def parameter_seeds(streams: Sequence[Streams], chosen: Mask) -> NDArray[np.uint
 
 def drawn_episodes(
     task: Task, workspace: Workspace, streams: Sequence[Streams], chosen: Mask, start: Floats
-) -> Draw:
+) -> tuple[Floats, Floats, Floats]:
     """What is drawn for new episodes of the chosen arms (N,).
 
     Args:
@@ -69,7 +69,7 @@ def drawn_episodes(
         own, position[arm], quaternion[arm] = task.draw(workspace, streams[arm].goals)
         if own is not None:
             start[arm] = own
-    return Draw(start, position, quaternion)
+    return start, position, quaternion
 
 
 def check_streams(streams: Any, num_envs: int) -> None:

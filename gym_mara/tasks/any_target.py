@@ -13,7 +13,6 @@ from gym_mara.arrays import Constants, zeros_like
 from gym_mara.errors import flag, one_of, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
-from gym_mara.tasks.arm_parts import ArmParts
 from gym_mara.tasks.base import Draw, Task, Workspace
 from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
@@ -92,6 +91,8 @@ class AnyTargetTask(Task):
 
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
         """Joint positions and velocities, the poses of the tool and the target, and the parts of `ArmParts`."""
+        from gym_mara.tasks.arm_parts import ArmParts  # which takes long: it needs Pinocchio
+
         parts = [
             observation.joint_positions(robot),
             observation.joint_velocities(joint_velocity),

@@ -65,12 +65,12 @@ class ArmParts:
         joints, turns = self._joints, self._orientation
         parts = [
             _part("position_error_at_scales", 3 * len(_SCALES), self.position_error_at_scales),
-            _part("joint_ways", joints, self.joint_ways, math.pi),
+            _part("joint_ways", joints, self.joint_ways, math.pi, "joint"),
         ]
         if turns:
             parts += [
                 _part("angle_error_at_scales", 3 * len(_ANGLE_SCALES), self.angle_error_at_scales),
-                _part("joint_turns", joints, self.joint_turns, math.pi),
+                _part("joint_turns", joints, self.joint_turns, math.pi, "rad"),
             ]
         return [
             *parts,
@@ -176,5 +176,5 @@ def _at_scales(xp: Any, error: Floats, scales: Floats) -> Floats:
     return xp.reshape(error[:, None] / (size[:, None] + scales[:, None]), (len(error), -1))
 
 
-def _part(name: str, size: int, values: Any, bound: float = 1.0) -> Part:
-    return Part(name, np.full(size, -bound), np.full(size, bound), values)
+def _part(name: str, size: int, values: Any, bound: float = 1.0, unit: str = "") -> Part:
+    return Part(name, np.full(size, -bound), np.full(size, bound), values, unit=unit)

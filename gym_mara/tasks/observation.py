@@ -39,7 +39,8 @@ class Part:
     joint_limits: bool = False
     """Whether the bounds are joint limits, which joints with dynamics may overshoot."""
     unit: str = ""
-    """The unit of the values, such as "m/s"; "joint" for that of each joint, rad (m), and "" for none. Exported policies name it."""
+    """The unit of the values, such as "m/s"; "joint" for that of each joint, rad (m), "joint/s" for that of its
+    velocity, and "" for none. Exported policies name it."""
 
 
 class Observation:
@@ -106,7 +107,7 @@ def joint_velocities(joint_velocity: Floats) -> Part:
         joint_velocity: the largest speed of each joint (J,), rad/s.
     """
     bound = np.maximum(joint_velocity, _NARROWEST)
-    return Part("joint_velocities", -bound, bound, _joint_velocities)
+    return Part("joint_velocities", -bound, bound, _joint_velocities, unit="joint/s")
 
 
 def last_action(space: Box) -> Part:

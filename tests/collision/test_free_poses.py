@@ -13,7 +13,9 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.catalog import robot_names
 from gym_mara.robot.inverse_kinematics import solve_ik
+from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.rotations import angle_between
+from gym_mara.testing import COLLIDING_Q
 from tests.helpers import joint_xml, robot_model, urdf_xml, write
 
 
@@ -53,3 +55,37 @@ def test_a_robot_that_always_collides_is_an_error(tmp_path: Path) -> None:
         robot = RobotModel.load(write(tmp_path / "stick.urdf", large), "link2")
     with pytest.raises(GymMaraError, match=r"stick collides at all of 10000 random.*its SRDF"):
         FreePoses(robot).draw(np.random.default_rng(0))
+
+
+def test_a_random_move_is_free_from_its_start_to_its_pose() -> None:
+    mara = robot_model("mara")
+    poses, checker = FreePoses(mara), make_checker("coal", mara)
+    collided = 0
+    for seed in range(30):
+        start, position, quaternion = poses.draw_move(np.random.default_rng(seed))
+        # The end is the last free configuration that the generator gives before its pose is this one.
+        rng, low, high = np.random.default_rng(seed), *reachable_range(mara)
+        while True:
+            end = rng.uniform(low, high)
+            place, turn = mara.kinematics().pose(end[None])
+            if np.array_equal(place[0], position) and np.array_equal(turn[0], quaternion):
+                break
+        fine = start + np.linspace(0.0, 1.0, 1001)[:, None] * (end - start)
+        touched = checker.check(fine)
+        assert not touched[[0, -1]].any()
+        collided += int(touched.sum())
+    # Between two checks the arm may graze itself: at most in a few of 30,000 configurations.
+    assert collided < 30
+
+
+def test_a_random_move_can_have_a_given_start() -> None:
+    mara = robot_model("mara")
+    start, position, _ = FreePoses(mara).draw_move(np.random.default_rng(0), mara.home)
+    np.testing.assert_array_equal(start, mara.home)
+    assert np.linalg.norm(position - mara.kinematics().pose(mara.home[None])[0][0]) > 0.0
+
+
+def test_a_start_that_collides_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gym_mara.collision.free_poses._TRIES", 20)
+    with pytest.raises(GymMaraError, match=r"20 random joint moves from .*choose another start_q"):
+        FreePoses(robot_model("mara")).draw_move(np.random.default_rng(0), np.array(COLLIDING_Q))

@@ -22,12 +22,14 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.view import view_of
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.tasks import TASKS
+from gym_mara.tasks import TASKS, AnyTargetTask
 from gym_mara.testing import COLLIDING_Q, COPIES, pickled
 from tests.helpers import robot_model
 
 ARMS = 5
 TOLERANCE = {"float64": 1e-12, "float32": 2e-3}
+SOLVED = {"float64": 1e-10, "float32": 0.02}
+"""The tolerance of the tasks whose observation has the solution of linear equations, near singular at home."""
 MODES = ("NextStep", "SameStep", "Disabled")
 DTYPES = ("float64", "float32")
 
@@ -67,31 +69,35 @@ def _tensors(value: Any) -> list[torch.Tensor]:
     return [value]
 
 
-def _assert_same(mine: Any, theirs: Any, dtype: str, name: str = "") -> None:
+def _assert_same(
+    mine: Any, theirs: Any, dtype: str, name: str = "", tolerance: dict[str, float] = TOLERANCE
+) -> None:
     """Equal trees; an object array of final observations equals the rows of a tensor."""
     if isinstance(theirs, dict):
         assert mine.keys() == theirs.keys(), name
         for key in theirs:
             if key == "final_obs":
                 chosen = theirs["_final_obs"]
-                _assert_same_finals(mine[key], theirs[key], chosen, dtype)
+                _assert_same_finals(mine[key], theirs[key], chosen, dtype, tolerance)
             else:
-                _assert_same(mine[key], theirs[key], dtype, key)
+                _assert_same(mine[key], theirs[key], dtype, key, tolerance)
         return
     kinds = {"f": getattr(torch, dtype), "b": torch.bool, "i": torch.int64}
     assert mine.dtype == kinds[theirs.dtype.kind], name
     assert mine.shape == theirs.shape, name
-    np.testing.assert_allclose(host(mine), theirs, rtol=0, atol=TOLERANCE[dtype], err_msg=name)
+    np.testing.assert_allclose(host(mine), theirs, rtol=0, atol=tolerance[dtype], err_msg=name)
 
 
-def _assert_same_finals(mine: Any, theirs: Any, chosen: Any, dtype: str) -> None:
+def _assert_same_finals(
+    mine: Any, theirs: Any, chosen: Any, dtype: str, tolerance: dict[str, float]
+) -> None:
     groups = {"": mine} if not isinstance(mine, dict) else mine
     for name, values in groups.items():
         assert len(values) == ARMS
         assert not values[torch.tensor(~chosen)].any()
         for arm in np.flatnonzero(chosen):
             expected = theirs[arm][name] if name else theirs[arm]
-            _assert_same(values[arm], expected, dtype, "final_obs")
+            _assert_same(values[arm], expected, dtype, "final_obs", tolerance)
 
 
 def _assert_same_runs(
@@ -100,9 +106,11 @@ def _assert_same_runs(
     """The same results for the same random actions, with ends of episodes, and with collisions if `collide` is true."""
     mine, theirs = tensors.reset(seed=3), arrays.reset(seed=3)
     collisions = ends = 0
+    solves = isinstance(arrays.simulation.task, AnyTargetTask)
+    tolerance = SOLVED if solves else TOLERANCE
     for actions in _actions(steps):
         for results, expected in zip(mine, theirs, strict=True):
-            _assert_same(results, expected, dtype)
+            _assert_same(results, expected, dtype, tolerance=tolerance)
         _tensors(mine)
         mine, theirs = tensors.step(actions), arrays.step(actions.numpy())
         infos = [theirs[4], theirs[4].get("final_info", {})]

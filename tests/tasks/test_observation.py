@@ -44,7 +44,10 @@ def test_split_recovers_the_parts_of_a_flat_observation(task: str, robot: str) -
     assert list(parts) == [part.name for part in observation.parts]
     np.testing.assert_array_equal(np.concatenate(list(parts.values()), axis=-1), flat)
     np.testing.assert_array_equal(parts["joint_positions"], state.q)
-    np.testing.assert_array_equal(parts["tool_velocity"], state.ee_velocity)
+    if "tool_velocity" in parts:
+        np.testing.assert_array_equal(parts["tool_velocity"], state.ee_velocity)
+    if "joint_velocities" in parts:
+        np.testing.assert_array_equal(parts["joint_velocities"], state.qd)
     one = observation.split(flat[3])
     for name, values in parts.items():
         np.testing.assert_array_equal(one[name], values[3])

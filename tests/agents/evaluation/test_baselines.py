@@ -134,6 +134,14 @@ def test_a_task_that_judges_actions_has_one(monkeypatch: pytest.MonkeyPatch) -> 
     assert moved("Smooth-v0", "pinocchio", {}).position_error[-1].max() < 1e-6
 
 
+def test_it_succeeds_at_almost_any_target() -> None:
+    options = {"max_joint_velocity": 1.57, "servo_gain": 20.0}
+    played = evaluate_baseline(
+        "ik", "MARAPose-v0", backend="pinocchio", episodes=20, options=options
+    )
+    assert played["success_percent"].mean() >= 80.0
+
+
 def test_an_unknown_baseline_is_an_error() -> None:
     with pytest.raises(GymMaraError, match="unknown baseline 'ikk'"):
         evaluate_baseline("ikk", "MARA-v0", backend="pinocchio")

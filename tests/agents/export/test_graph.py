@@ -20,7 +20,12 @@ from torch import nn
 from gym_mara.agents.algorithms.natural_gaussian import NaturalGaussianPolicy
 from gym_mara.agents.algorithms.unit_policy import MlpPolicy
 from gym_mara.agents.export.graph import to_onnx
-from gym_mara.agents.runs.description import Normalisation, ObservationPart, PolicyDescription
+from gym_mara.agents.runs.description import (
+    ABSOLUTE,
+    Normalisation,
+    ObservationPart,
+    PolicyDescription,
+)
 from gym_mara.agents.runs.policy import Policy
 from gym_mara.agents.scaling import unit_box
 from gym_mara.errors import GymMaraError
@@ -43,7 +48,9 @@ def described(
     size = sum(groups.values()) if groups else FLAT
     part = ObservationPart("all", size)
     joints = [f"joint{number}" for number in range(JOINTS)]
-    return PolicyDescription(1, joints, LOW, HIGH, [part], groups, normalisation, "0", {})
+    return PolicyDescription(
+        2, joints, LOW, HIGH, [part], groups, normalisation, "0", {}, ABSOLUTE, 0.02
+    )
 
 
 def box(size: int) -> Box:

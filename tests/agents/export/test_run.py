@@ -20,6 +20,7 @@ from gym_mara.agents.runs import load_policy
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.deploy import OnnxPolicy
+from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from tests.agents.conftest import ROLLOUT, config, silent
 from tests.helpers import Cli, joint_xml, urdf_xml, write
@@ -74,6 +75,23 @@ def test_it_acts_as_the_policy_on_10_000_observations(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
     check_parity(finished_run, tmp_path / "policy.onnx", 10_000)
+
+
+def test_a_policy_of_joint_steps_gives_the_targets_of_the_environment(tmp_path: Path) -> None:
+    options = {"max_joint_velocity": 1.57, "start": "home"}
+    changes: dict[str, Any] = {"env": "MARAReach-v0", "env_options": options}
+    run = train(config(steps=ROLLOUT, **changes), tmp_path / "run", silent)
+    check_parity(run, tmp_path / "policy.onnx", 500)
+    policy = OnnxPolicy(tmp_path / "policy.onnx")
+    env = MaraEnv("MARAReach-v0", **options)
+    observation, _ = env.reset(seed=0)
+    for _ in range(30):
+        action, q = policy.predict(observation)[0], env.simulation.backend.state.q[0]
+        targets = policy.targets(action, q)
+        np.testing.assert_allclose(targets, env.simulation.actions.targets(action[None])[0])
+        observation, *_ = env.step(action)
+        # Joints reach the targets of their steps within the period.
+        np.testing.assert_allclose(env.simulation.backend.state.q[0], targets, atol=1e-9)
 
 
 def test_evaluate_policy_of_stable_baselines3_takes_it(

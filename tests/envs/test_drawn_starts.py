@@ -1,0 +1,106 @@
+"""Episodes with a drawn start: each begins there, alone and in a batch, and returns there after a collision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from gym_mara.collision import make_checker
+from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.robot import RobotModel
+from gym_mara.testing import pickled
+
+TASKS = ("MARAReach-v0", "MARAPose-v0")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasiums_checker_accepts_it_without_a_warning(
+    task: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    check_env(gymnasium.make(f"gym_mara/{task}").unwrapped, skip_render_check=True)
+    assert [str(warning.message) for warning in recwarn] == []
+
+
+def test_episodes_begin_at_different_free_configurations_at_rest(mara: RobotModel) -> None:
+    envs = MaraVectorEnv(50, "MARAReach-v0")
+    envs.reset(seed=0)
+    state = envs.simulation.backend.state
+    assert not make_checker("coal", mara).check(state.q).any()
+    assert not state.collided.any()
+    assert len(np.unique(state.q, axis=0)) == 50
+    assert (state.qd == 0.0).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_arm_of_a_batch_has_the_episodes_of_the_environment_with_its_seed(task: str) -> None:
+    count, options = 3, {"max_episode_steps": 4}
+    envs = MaraVectorEnv(count, task, autoreset_mode="SameStep", **options)
+    singles = [gymnasium.make(f"gym_mara/{task}", **options) for _ in range(count)]
+    together, _ = envs.reset(seed=5)
+    rng = np.random.default_rng(0)
+    alone = [env.reset(seed=5 + arm)[0] for arm, env in enumerate(singles)]
+    starts = []
+    for _ in range(10):
+        np.testing.assert_allclose(together, np.array(alone), rtol=0.0, atol=1e-9)
+        actions = rng.uniform(-1.0, 1.0, (count, 6)).astype(np.float32)
+        together, rewards, *_ = envs.step(actions)
+        for arm, env in enumerate(singles):
+            alone[arm], reward, terminated, truncated, _ = env.step(actions[arm])
+            assert rewards[arm] == pytest.approx(reward, abs=1e-9)
+            if terminated or truncated:
+                alone[arm], _ = env.reset()
+                starts.append(alone[arm][:6])
+    assert len(np.unique(starts, axis=0)) == len(starts) >= 2 * count, "each draws a new start"
+
+
+def test_after_a_collision_the_arm_returns_to_the_start_of_its_episode() -> None:
+    env = MaraEnv("MARAReach-v0", on_collision="reset", max_joint_velocity=3.0, action="absolute")
+    collisions = 0
+    for seed in range(20):
+        start = env.reset(seed=seed)[0][:6].copy()
+        for _ in range(60):
+            *_, info = env.step(env.action_space.high)
+            if info["collided"]:
+                collisions += 1
+                np.testing.assert_array_equal(env.simulation.backend.state.q[0], start)
+    assert collisions > 0
+
+
+@pytest.mark.parametrize("start", ["random", "home"])
+def test_a_snapshot_keeps_the_start(start: str) -> None:
+    env = MaraEnv("MARAPose-v0", on_collision="reset", start=start)
+    first = env.reset(seed=1)[0][:6].copy()
+    snapshot = env.save_state()
+    env.reset(seed=2)
+    env.restore_state(snapshot)
+    np.testing.assert_array_equal(env.simulation._start[0], first)
+    results: list[Any] = []
+    for each in (env, pickled(env)):
+        each.action_space.seed(0)
+        results.append([each.step(each.action_space.sample())[1] for _ in range(20)])
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("action", ["absolute", "relative", "cartesian"])
+@pytest.mark.parametrize("task", [*TASKS, "MARA-v0", "MARARandomTarget-v0"])
+def test_every_task_runs_with_every_action_mode(mara: RobotModel, task: str, action: str) -> None:
+    env = MaraEnv(task, action=action)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(20):
+        chosen = env.action_space.sample()
+        observation, reward, terminated, _, _ = env.step(chosen)
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(reward)
+        if task in TASKS:
+            if action == "absolute":
+                chosen = chosen.clip(mara.lower, mara.upper)
+            np.testing.assert_array_equal(observation[-len(chosen) :], chosen)
+        if terminated:
+            observation, _ = env.reset()
+            if task in TASKS:
+                assert (observation[-len(chosen) :] == 0.0).all()
