@@ -78,7 +78,7 @@ def test_it_acts_as_the_policy_on_10_000_observations(
 
 
 def test_a_policy_of_joint_steps_gives_the_targets_of_the_environment(tmp_path: Path) -> None:
-    options = {"max_joint_velocity": 1.57, "start": "home"}
+    options: dict[str, Any] = {"max_joint_velocity": 1.57, "start": "home"}
     changes: dict[str, Any] = {"env": "MARAReach-v0", "env_options": options}
     run = train(config(steps=ROLLOUT, **changes), tmp_path / "run", silent)
     check_parity(run, tmp_path / "policy.onnx", 500)
@@ -89,9 +89,9 @@ def test_a_policy_of_joint_steps_gives_the_targets_of_the_environment(tmp_path: 
         action, q = policy.predict(observation)[0], env.simulation.backend.state.q[0]
         targets = policy.targets(action, q)
         np.testing.assert_allclose(targets, env.simulation.actions.targets(action[None])[0])
-        observation, *_ = env.step(action)
+        observation, *_ = env.step(action.astype(np.float32))
         # Joints reach the targets of their steps within the period.
-        np.testing.assert_allclose(env.simulation.backend.state.q[0], targets, atol=1e-9)
+        np.testing.assert_allclose(env.simulation.backend.state.q[0], targets, atol=1e-7)
 
 
 def test_evaluate_policy_of_stable_baselines3_takes_it(
