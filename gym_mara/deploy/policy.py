@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from gym_mara.extras import needs
 from gym_mara.files import DamagedFileError, read_bytes
 from gym_mara.types import Floats
 
-with needs("an exported policy", "deploy", "onnxruntime"):
+if TYPE_CHECKING:
     import onnxruntime
 
 LARGEST = 2**26
@@ -37,6 +37,10 @@ class OnnxPolicy:
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
+        # Here, because gym_mara exports policies also where onnxruntime is not installed.
+        with needs("an exported policy", "deploy", "onnxruntime"):
+            import onnxruntime
+
         file = Path(path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1

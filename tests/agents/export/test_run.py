@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -205,3 +207,25 @@ def test_the_command(finished_run: RunFolder, tmp_path: Path, gym_mara: Cli) -> 
     code, _, error = gym_mara("export", tmp_path, tmp_path / "other.onnx")
     assert code == 2
     assert "is not a run folder" in error
+
+
+def test_a_policy_is_exported_where_onnxruntime_is_not_installed_and_played_nowhere_without_it(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    program = f"""
+import sys
+from pathlib import Path
+
+sys.modules["onnxruntime"] = None
+from gym_mara.agents.export.run import export
+from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.deploy import OnnxPolicy
+
+export(RunFolder.open(Path({str(finished_run.path)!r})), Path("policy.onnx"))
+OnnxPolicy("policy.onnx")
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (tmp_path / "policy.onnx").is_file(), result.stderr
+    assert "MissingExtraError: an exported policy needs onnxruntime" in result.stderr
