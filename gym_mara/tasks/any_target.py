@@ -95,6 +95,7 @@ class AnyTargetTask(Task):
 
         parts = [
             observation.joint_positions(robot),
+            observation.joint_cosines_and_sines(robot),
             observation.joint_velocities(joint_velocity),
             observation.tool_position(robot),
             observation.target_position(robot),

@@ -5,7 +5,6 @@ They take forward kinematics alone, which a real arm knows as well; no inverse k
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,10 +24,12 @@ DAMPING = 0.05
 """Of the least squares, m: it keeps a joint's step small near a singularity."""
 STEP_TIME = 0.02
 """A step of the least squares is relative to how far a joint travels in this time, s."""
-_SCALES, _ANGLE_SCALES = (0.1, 0.03), (0.3, 0.1)
-"""At each of these scales k, m or rad, an error e is observed as e / (|e| + k)."""
+_SCALES, _ANGLE_SCALES, _JOINT_SCALES = (1.0, 0.1, 0.03), (3.0, 0.3, 0.03), (1.0, 0.1)
+"""At each of these scales k (m, rad, and rad or m of a joint) a value v is observed as v / (|v| + k)."""
+_FAR_STEP = 0.3
+"""The scale of a step of the least squares, rad (m)."""
 _LEVER = 0.01
-"""With levers of this length, m, a joint's way to the target counts half; it is undefined with none."""
+"""With levers of this length, m, a joint's way to the target counts a quarter; it is undefined with none."""
 _SMALL = 1e-9
 
 
@@ -54,7 +55,7 @@ class ArmParts:
         damping = DAMPING**2 * np.eye(len(rows))
         step = STEP_TIME * joint_velocity
         self._constants = Constants(slides, rows[:, None], damping, step, _SMALL, _LEVER)
-        self._scales = Constants(_SCALES, _ANGLE_SCALES)
+        self._scales = Constants(_SCALES, _ANGLE_SCALES, _JOINT_SCALES, _FAR_STEP)
         self._seen: tuple[Any, ...] = (None, None)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -62,19 +63,20 @@ class ArmParts:
 
     def parts(self) -> list[Part]:
         """All parts, in order."""
-        joints, turns = self._joints, self._orientation
+        joints = self._joints
+        at_scales = len(_JOINT_SCALES) * joints
         parts = [
             _part("position_error_at_scales", 3 * len(_SCALES), self.position_error_at_scales),
-            _part("joint_ways", joints, self.joint_ways, math.pi, "joint"),
+            _part("joint_ways", at_scales, self.joint_ways_at_scales),
         ]
-        if turns:
+        if self._orientation:
             parts += [
                 _part("angle_error_at_scales", 3 * len(_ANGLE_SCALES), self.angle_error_at_scales),
-                _part("joint_turns", joints, self.joint_turns, math.pi, "rad"),
+                _part("joint_turns", at_scales, self.joint_turns_at_scales),
             ]
         return [
             *parts,
-            _part("joint_steps", joints, self.joint_steps),
+            _part("joint_steps", 2 * joints, self.joint_steps),
             _part("clearance", 1, self.clearance),
             _part("joint_repulsions", joints, self.joint_repulsions),
         ]
@@ -82,14 +84,28 @@ class ArmParts:
     def position_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
         """The way from the tool to the target e (N, 3), m, as e / (|e| + k) for each scale k."""
         _, way, _, _ = self._look(state, goal)
-        xp, scales, _ = self._scales.like(way)
-        return _at_scales(xp, way, scales)
+        xp, scales, *_ = self._scales.like(way)
+        size = xp.sqrt(xp.sum(way * way, axis=-1, keepdims=True))
+        return _at_scales(xp, way, size, scales)
 
     def angle_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
         """The rotation vector from the tool to the target θ (N, 3), rad, as θ / (|θ| + k) for each scale k."""
         _, _, turn, _ = self._look(state, goal)
-        xp, _, scales = self._scales.like(turn)
-        return _at_scales(xp, turn, scales)
+        xp, _, scales, *_ = self._scales.like(turn)
+        size = xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
+        return _at_scales(xp, turn, size, scales)
+
+    def joint_ways_at_scales(self, state: SimState, goal: Goal) -> Floats:
+        """`joint_ways` x as x / (|x| + k) for each scale k (N, S J)."""
+        ways = self.joint_ways(state, goal)
+        xp, _, _, scales, _ = self._scales.like(ways)
+        return _at_scales(xp, ways, xp.abs(ways), scales)
+
+    def joint_turns_at_scales(self, state: SimState, goal: Goal) -> Floats:
+        """`joint_turns` x as x / (|x| + k) for each scale k (N, S J)."""
+        turns = self.joint_turns(state, goal)
+        xp, _, _, scales, _ = self._scales.like(turns)
+        return _at_scales(xp, turns, xp.abs(turns), scales)
 
     def joint_ways(self, state: SimState, goal: Goal) -> Floats:
         """How far each joint alone must move to bring the tool nearest to the target (N, J), rad (m for a prismatic joint).
@@ -106,7 +122,7 @@ class ArmParts:
         sine = xp.sum(xp.linalg.cross(tool, target) * axes, axis=-1)
         cosine = xp.sum(tool * target, axis=-1) - tool_along * target_along
         levers = xp.sqrt(sine * sine + cosine * cosine)  # the product of both
-        angle = xp.atan2(sine, cosine) * (levers / (levers + lever**2))
+        angle = xp.atan2(sine, cosine) * (levers / (levers + lever**2)) ** 2
         return angle + slides * (target_along - tool_along - angle)
 
     def joint_turns(self, state: SimState, goal: Goal) -> Floats:
@@ -124,9 +140,10 @@ class ArmParts:
         return angle - slides * angle
 
     def joint_steps(self, state: SimState, goal: Goal) -> Floats:
-        """The step of all joints by damped least squares (N, J), relative to how far joints travel in STEP_TIME, at most 1.
+        """The step of all joints by damped least squares, near and far from the target (N, 2 J).
 
-        δ = Jᵀ (J Jᵀ + λ² I)⁻¹ e (Wampler 1986, doi 10.1109/TSMC.1986.289285); a longer step is shortened as a whole.
+        δ = Jᵀ (J Jᵀ + λ² I)⁻¹ e (Wampler 1986, doi 10.1109/TSMC.1986.289285). First relative to how far joints travel in
+        STEP_TIME, where a step beyond 1 is shortened as a whole; then δ / (max |δ| + 0.3 rad).
         """
         frames, way, turn, _ = self._look(state, goal)
         xp, _, rows, damping, step, _, _ = self._constants.like(way)
@@ -136,9 +153,12 @@ class ArmParts:
         error = (error * rows[:, 0])[..., None]
         gram = jacobian @ xp.permute_dims(jacobian, (0, 2, 1)) + damping
         solved = xp.linalg.solve(gram, error)
-        steps = (xp.permute_dims(jacobian, (0, 2, 1)) @ solved)[..., 0] / step
-        longest = xp.max(xp.abs(steps), axis=-1, keepdims=True)
-        return steps / xp.where(longest > 1.0, longest, xp.ones_like(longest))
+        whole = (xp.permute_dims(jacobian, (0, 2, 1)) @ solved)[..., 0]
+        far = whole / (xp.max(xp.abs(whole), axis=-1, keepdims=True) + self._scales.like(whole)[4])
+        near = whole / step
+        longest = xp.max(xp.abs(near), axis=-1, keepdims=True)
+        near = near / xp.where(longest > 1.0, longest, xp.ones_like(longest))
+        return xp.concat([near, far], axis=-1)
 
     def clearance(self, state: SimState, goal: Goal) -> Floats:
         """The least distance of links that may collide, by `gym_mara.robot.clearance` (N, 1), m, relative to its largest value."""
@@ -171,10 +191,10 @@ class ArmParts:
         return self._seen[3]  # type: ignore[no-any-return]
 
 
-def _at_scales(xp: Any, error: Floats, scales: Floats) -> Floats:
-    size = xp.sqrt(xp.sum(error * error, axis=-1, keepdims=True))
-    return xp.reshape(error[:, None] / (size[:, None] + scales[:, None]), (len(error), -1))
+def _at_scales(xp: Any, values: Floats, size: Floats, scales: Floats) -> Floats:
+    """Values v (N, K) of a size |v|, (N, K) or (N, 1), as v / (|v| + k) for each scale k (N, S K)."""
+    return xp.reshape(values[:, None] / (size[:, None] + scales[:, None]), (len(values), -1))
 
 
-def _part(name: str, size: int, values: Any, bound: float = 1.0, unit: str = "") -> Part:
-    return Part(name, np.full(size, -bound), np.full(size, bound), values, unit=unit)
+def _part(name: str, size: int, values: Any) -> Part:
+    return Part(name, np.full(size, -1.0), np.full(size, 1.0), values)

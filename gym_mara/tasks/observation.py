@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 _ONE = 1.0 + 1e-9
 """The bound of a unit quaternion's components, with a margin for rounding."""
 
+_ROUNDING = 1e-6
+"""By how much an engine with numbers in single precision may exceed a velocity limit, relative to it."""
+
 _NARROWEST = 1e-9
 """The least difference of two bounds."""
 
@@ -100,13 +103,19 @@ def joint_positions(robot: RobotModel) -> Part:
     )
 
 
+def joint_cosines_and_sines(robot: RobotModel) -> Part:
+    """The cosines of the joint positions (J,), then their sines."""
+    bound = np.ones(2 * robot.num_joints)
+    return Part("joint_cosines_and_sines", -bound, bound, _joint_cosines_and_sines)
+
+
 def joint_velocities(joint_velocity: Floats) -> Part:
     """The joint velocities (J,), rad/s (m/s for a prismatic joint).
 
     Args:
         joint_velocity: the largest speed of each joint (J,), rad/s.
     """
-    bound = np.maximum(joint_velocity, _NARROWEST)
+    bound = np.maximum((1.0 + _ROUNDING) * joint_velocity, _NARROWEST)
     return Part("joint_velocities", -bound, bound, _joint_velocities, unit="joint/s")
 
 
@@ -175,6 +184,11 @@ def _quaternion(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:
 
 def _joint_positions(state: SimState, goal: Goal) -> Floats:
     return state.q
+
+
+def _joint_cosines_and_sines(state: SimState, goal: Goal) -> Floats:
+    xp = namespace(state.q)
+    return xp.concat([xp.cos(state.q), xp.sin(state.q)], axis=-1)
 
 
 def _joint_velocities(state: SimState, goal: Goal) -> Floats:
