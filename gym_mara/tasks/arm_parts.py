@@ -1,6 +1,7 @@
 """Parts of an observation that need the arm's geometry: which way each joint leads to the target, and which into a collision.
 
-They take forward kinematics alone, which a real arm knows as well; no inverse kinematics is solved.
+They take forward kinematics and the Jacobian, which a real arm knows as well. `joint_steps` is one step of differential inverse
+kinematics; no configuration for the target is known.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gym_mara.arrays import Constants
-from gym_mara.robot.clearance import FAR, WIDTH, Clearance
+from gym_mara.robot.clearance import FAR, Clearance
 from gym_mara.robot.kinematics import JointFrames
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
@@ -30,6 +31,10 @@ _FAR_STEP = 0.3
 """The scale of a step of the least squares, rad (m)."""
 _LEVER = 0.01
 """With levers of this length, m, a joint's way to the target counts a quarter; it is undefined with none."""
+_CLOSE, _OVERLAP = 0.03, 0.1
+"""The scale of a small clearance, and the largest overlap of spheres, m."""
+_PUSH, _STRONG = 0.05, 1.0
+"""The scales of the direction and of the strength of a repulsion, m/rad."""
 _SMALL = 1e-9
 
 
@@ -77,8 +82,8 @@ class ArmParts:
         return [
             *parts,
             _part("joint_steps", 2 * joints, self.joint_steps),
-            _part("clearance", 1, self.clearance),
-            _part("joint_repulsions", joints, self.joint_repulsions),
+            _part("clearance", 2, self.clearance),
+            _part("joint_repulsions", 2 * joints, self.joint_repulsions),
         ]
 
     def position_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
@@ -161,15 +166,22 @@ class ArmParts:
         return xp.concat([near, far], axis=-1)
 
     def clearance(self, state: SimState, goal: Goal) -> Floats:
-        """The least distance of links that may collide, by `gym_mara.robot.clearance` (N, 1), m, relative to its largest value."""
+        """The least distance d of links that may collide, by `gym_mara.robot.clearance` (N, 2): d / FAR, and e^(-(d + 0.1)/0.03)."""
         least, _ = self._nearness(state, goal)
-        return least[:, None] / FAR
+        xp = self._constants.like(least)[0]
+        return xp.stack([least / FAR, xp.exp(-(least + _OVERLAP) / _CLOSE)], axis=-1)
 
     def joint_repulsions(self, state: SimState, goal: Goal) -> Floats:
-        """Which way each joint leads away from collisions (N, J), from -1 to 1."""
+        """Which way each joint leads away from collisions, and how strongly (N, 2 J), from -1 to 1.
+
+        The repulsion r as r / (max |r| + 0.05 m/rad), and as r / (|r| + 1 m/rad).
+        """
         _, repulsion = self._nearness(state, goal)
         xp = self._constants.like(repulsion)[0]
-        return repulsion / (xp.abs(repulsion) + WIDTH)
+        largest = xp.max(xp.abs(repulsion), axis=-1, keepdims=True)
+        return xp.concat(
+            [repulsion / (largest + _PUSH), repulsion / (xp.abs(repulsion) + _STRONG)], axis=-1
+        )
 
     def _look(self, state: SimState, goal: Goal) -> tuple[JointFrames, Floats, Floats, Floats]:
         """The frames of the joints; the way (N, 3), m, and the rotation vector (N, 3), rad, from the tool to the target; and

@@ -12,6 +12,7 @@ import torch
 from gym_mara import rotations
 from gym_mara.arrays import host
 from gym_mara.robot import RobotModel
+from gym_mara.robot.clearance import Clearance
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal
 from gym_mara.tasks.arm_parts import DAMPING, STEP_TIME, ArmParts
@@ -50,6 +51,10 @@ def _state(robot: RobotModel, q: Floats) -> SimState:
     return SimState(
         q, 0 * q, position, quaternion, np.zeros((count, 3)), np.zeros(count, bool), np.zeros(count)
     )
+
+
+def _least_distance(mara: RobotModel, q: Floats) -> Floats:
+    return Clearance(mara)(mara.kinematics().joint_frames(q))[0]
 
 
 def _scene(robot: RobotModel, count: int = 30) -> tuple[SimState, Goal]:
@@ -138,6 +143,21 @@ def test_all_parts_stay_in_their_bounds_at_the_target_and_everywhere(robot: Robo
             assert np.isfinite(values).all(), part.name
             assert (values >= part.low).all(), part.name
             assert (values <= part.high).all(), part.name
+
+
+def test_clearance_and_repulsion_tell_near_from_far() -> None:
+    mara = robot_model("mara")
+    q = np.zeros((40, 6))
+    q[:, 1] = np.linspace(0.0, 1.9, 40)  # towards the table
+    state, goal = _state(mara, q), Goal(*mara.kinematics().pose(q))
+    parts = _parts(mara)
+    least = _least_distance(mara, q)
+    order = np.argsort(least)
+    near = parts.clearance(state, goal)[order]
+    assert (np.diff(near[:, 0]) >= 0.0).all()
+    assert (np.diff(near[:, 1]) <= 0.0).all()
+    strength = np.abs(parts.joint_repulsions(state, goal)[:, 6:]).max(axis=1)
+    assert strength[order[0]] > 2.0 * strength[order[-1]]
 
 
 def test_tensors_give_the_numbers_of_arrays_and_a_copy_the_same(robot: RobotModel) -> None:
