@@ -10,7 +10,7 @@ import numpy as np
 
 from gym_mara import rotations
 from gym_mara.arrays import Constants, zeros_like
-from gym_mara.errors import flag, one_of, positive_number
+from gym_mara.errors import flag, one_of
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
 from gym_mara.tasks.base import Draw, Task, Workspace
@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 STARTS = ("random", "home")
 _ONE = Constants(1.0)
 # The smallest and the largest positive value of each number, its unit, and whether it can be zero.
-_RANGES = {
+_TOLERANCES = {
     "position_tolerance": (1e-6, 1.0, "m", False),
     "angle_tolerance": (1e-6, np.pi, "rad", False),
+}
+_WEIGHTS = {
     "length_per_angle": (1e-3, 10.0, "m/rad", False),
     "rate_weight": (1e-6, 1e3, "", True),
     "collision_weight": (1e-6, 1e6, "", True),
@@ -67,17 +69,8 @@ class AnyTargetTask(Task):
         super().__post_init__()
         object.__setattr__(self, "orientation", flag("orientation", self.orientation))
         one_of("start", self.start, STARTS)
-        for name, (low, high, unit, or_zero) in _RANGES.items():
-            value = positive_number(
-                name,
-                getattr(self, name),
-                unit,
-                or_zero=or_zero,
-                at_least=low,
-                at_most=high,
-                reason="the reward is not accurate with others",
-            )
-            object.__setattr__(self, name, value)
+        self._check_ranges(_TOLERANCES, "others say nothing about a success")
+        self._check_ranges(_WEIGHTS, "the reward is not accurate with others")
 
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
         """The default pose of the workspace, until the first episode draws another."""

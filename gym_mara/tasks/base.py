@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from gym_mara.arrays import zeros_like
-from gym_mara.errors import finite_numbers, one_of
+from gym_mara.errors import finite_numbers, one_of, positive_number
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
 from gym_mara.tasks.observation import Part
@@ -97,6 +97,30 @@ class Task(ABC):
         if values is None:
             return
         object.__setattr__(self, name, tuple(finite_numbers(name, values, length)))
+
+    def _check_ranges(
+        self, ranges: Mapping[str, tuple[float, float, str, bool]], reason: str
+    ) -> None:
+        """Make values floats, and check them.
+
+        Args:
+            ranges: the smallest and the largest positive value of each, its unit, and whether it can be zero, by name.
+            reason: why others are refused.
+
+        Raises:
+            GymMaraError: a value is out of its range.
+        """
+        for name, (low, high, unit, or_zero) in ranges.items():
+            value = positive_number(
+                name,
+                getattr(self, name),
+                unit,
+                or_zero=or_zero,
+                at_least=low,
+                at_most=high,
+                reason=reason,
+            )
+            object.__setattr__(self, name, value)
 
     @abstractmethod
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:

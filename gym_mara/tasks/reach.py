@@ -11,7 +11,7 @@ import numpy as np
 
 from gym_mara import rotations
 from gym_mara.arrays import Constants, zeros_like
-from gym_mara.errors import GymMaraError, flag, positive_number
+from gym_mara.errors import GymMaraError, flag
 from gym_mara.state import SimState
 from gym_mara.tasks import observation, rewards
 from gym_mara.tasks.base import Task, Workspace
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 # The arm must be able to reach a target within this distance (m) and angle (rad), otherwise there is a warning.
 _REACH_TOLERANCE = (1e-3, 1e-2)
-# The smallest and the largest positive value of each constant of the reward, and whether it can be zero.
+# The smallest and the largest positive value of each constant of the reward, its unit, and whether it can be zero.
 _RANGES = {
-    "alpha": (1e-3, 1e3, False),
-    "beta": (1e-3, 1e2, False),
-    "gamma": (1e-9, 1e6, True),
-    "delta": (1e-9, 1e6, True),
-    "eta": (1e-9, 1e3, True),
-    "kappa": (1e-3, 1e3, False),
+    "alpha": (1e-3, 1e3, "", False),
+    "beta": (1e-3, 1e2, "", False),
+    "gamma": (1e-9, 1e6, "", True),
+    "delta": (1e-9, 1e6, "", True),
+    "eta": (1e-9, 1e3, "", True),
+    "kappa": (1e-3, 1e3, "", False),
 }
 # The second takes the Euclidean norm of three components to their root mean square.
 _ONE_AND_RMS = Constants(1.0, 3.0**-0.5)
@@ -74,16 +74,7 @@ class ReachTask(Task):
                 f"target_quaternion {quaternion} has length {np.linalg.norm(quaternion):.4f}; "
                 "give a unit quaternion [w, x, y, z]"
             )
-        for name, (low, high, or_zero) in _RANGES.items():
-            value = positive_number(
-                name,
-                getattr(self, name),
-                or_zero=or_zero,
-                at_least=low,
-                at_most=high,
-                reason="the reward is not accurate with others",
-            )
-            object.__setattr__(self, name, value)
+        self._check_ranges(_RANGES, "the reward is not accurate with others")
 
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
         """The target pose of each arm; warns if a target that the user gave is out of reach."""
