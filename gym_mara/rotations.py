@@ -95,6 +95,29 @@ def _outer_product_map() -> tuple[Floats, Floats]:
 _OUTER_PRODUCT = Constants(*_outer_product_map())
 
 
+def _rotation_map() -> Floats:
+    """The linear map from a flattened q qᵀ (16,) to the flattened rotation matrix (9,)."""
+    linear = np.zeros((4, 4, 3, 3))
+    for axis in range(3):
+        signs = -np.ones(4)
+        signs[[0, axis + 1]] = 1.0
+        linear[..., axis, axis] = np.diag(signs)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        for row, column, sign in ((j, i, 1.0), (i, j, -1.0)):
+            linear[0, axis + 1, row, column] = 2.0 * sign
+            linear[i + 1, j + 1, row, column] = 2.0
+    return linear.reshape(16, 9)
+
+
+_ROTATION = Constants(_rotation_map())
+
+
+def to_matrix(q: Floats) -> Floats:
+    """The rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
+    _, linear = _ROTATION.like(q)
+    return ((q[:, :, None] * q[:, None, :]).reshape(-1, 16) @ linear).reshape(-1, 3, 3)
+
+
 def from_matrix(rotation: Floats) -> Floats:
     """The quaternions (N, 4), w >= 0, of rotation matrices (N, 3, 3).
 

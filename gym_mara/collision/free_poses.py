@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
@@ -13,6 +14,8 @@ from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.types import Floats
 
 _TRIES = 10_000
+ROOM = 0.02
+"""Around the start and the end of a move each joint can turn so far without a collision, rad (m)."""
 _STEP = 0.05
 """How far a joint moves at most between two checks of a move, rad (m)."""
 
@@ -27,6 +30,7 @@ class FreePoses:
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
         self._checker = CoalChecker(robot)
+        self._with_room = self._checker.with_margin(np.full(robot.num_joints, ROOM))
         self._kinematics = robot.kinematics()
         self._low, self._high = reachable_range(robot)
 
@@ -36,12 +40,14 @@ class FreePoses:
         Raises:
             GymMaraError: none of many random configurations is free.
         """
-        return self._pose(self._free_configuration(generator))
+        return self._pose(self._free_configuration(generator, self._checker))
 
     def draw_move(
         self, generator: np.random.Generator, start: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
-        """A start (J,), rad, drawn as in `draw` unless it is given, and a pose to which a free joint move leads.
+        """A start (J,), rad, unless it is given, and a pose to which a free joint move leads.
+
+        Both configurations are drawn uniformly from those with ROOM around them.
 
         Returns:
             The start; and the pose, position (3,), m, and quaternion (4,), [w, x, y, z], of another configuration. No collision
@@ -51,8 +57,10 @@ class FreePoses:
             GymMaraError: no free configuration, or none with a free move, is found.
         """
         for _ in range(_TRIES):
-            begin = self._free_configuration(generator) if start is None else start
-            end = self._free_configuration(generator)
+            begin = start
+            if begin is None:
+                begin = self._free_configuration(generator, self._with_room)
+            end = self._free_configuration(generator, self._with_room)
             if not self._checker.check(self._move(begin, end)).any():
                 return begin, *self._pose(end)
         raise GymMaraError(
@@ -70,10 +78,12 @@ class FreePoses:
         position, quaternion = self._kinematics.pose(q[None])
         return position[0], quaternion[0]
 
-    def _free_configuration(self, generator: np.random.Generator) -> Floats:
+    def _free_configuration(
+        self, generator: np.random.Generator, checker: CollisionChecker
+    ) -> Floats:
         for _ in range(_TRIES):
             q = generator.uniform(self._low, self._high)
-            if not self._checker.check(q[None])[0]:
+            if not checker.check(q[None])[0]:
                 return q
         raise GymMaraError(
             f"{self._robot.name} collides at all of {_TRIES} random configurations; "

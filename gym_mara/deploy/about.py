@@ -24,6 +24,8 @@ OBSERVATION = "observation"
 """The name of the model's input if the observation is an array."""
 ACTION = "action"
 """The name of the model's output."""
+PACE = "pace"
+"""The name of the observation's part by which steps are multiplied, if it has one."""
 MODES = ("absolute", "relative", "cartesian")
 REFERENCES = ("position", "target")
 

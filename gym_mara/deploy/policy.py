@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.deploy.about import ACTION, METADATA_KEY, About
+from gym_mara.deploy.about import ACTION, METADATA_KEY, PACE, About
 from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.files import DamagedFileError, read_bytes
@@ -115,7 +115,11 @@ class OnnxPolicy:
         return actions if shapes.pop() else actions[0], None
 
     def targets(
-        self, action: ArrayLike, q: ArrayLike, last_target: ArrayLike | None = None
+        self,
+        action: ArrayLike,
+        q: ArrayLike,
+        last_target: ArrayLike | None = None,
+        pace: ArrayLike | None = None,
     ) -> Floats:
         """The joint targets (J,) or (N, J), rad (m), of an action (A,) or (N, A).
 
@@ -126,9 +130,11 @@ class OnnxPolicy:
             action: from `predict`.
             q: the joint positions now (J,) or (N, J), rad (m).
             last_target: the last targets, needed for relative actions that start from them; at the start of an episode q.
+            pace: the part `pace` of the observation (1,) or (N, 1), in [0, 1], needed if it has one: steps are multiplied by it.
 
         Raises:
-            GymMaraError: an array has another shape or is not finite, the last targets are missing, or actions are cartesian.
+            GymMaraError: an array has another shape or is not finite, the last targets or the pace are missing, or actions are
+                cartesian.
         """
         about = self.about.action
         joints = len(self._lower)
@@ -148,9 +154,24 @@ class OnnxPolicy:
         if len(shapes := {asked.shape, here.shape, start.shape}) > 1:
             raise GymMaraError(f"the arrays must be of equally many arms, not of shapes {shapes}")
         if about.mode == "relative":
-            asked = start + asked * self._steps
+            asked = start + asked * self._steps * self._pace(pace, here.shape)
         near = np.clip(asked, here - self._travel, here + self._travel)
         return np.clip(near, self._lower, self._upper)
+
+    def _pace(self, pace: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
+        """The pace, for joint positions of a shape (J,) or (N, J)."""
+        if all(part.name != PACE for part in self.about.observation):
+            return np.ones(1)
+        if pace is None:
+            raise GymMaraError(
+                f"steps are multiplied by the observation's part {PACE!r}: give it as {PACE}"
+            )
+        checked = np.clip(_rows(PACE, pace, 1), 0.0, 1.0)
+        if checked.shape[:-1] != shape[:-1]:
+            raise GymMaraError(
+                f"{PACE} has shape {checked.shape}; it must have one row for each arm"
+            )
+        return checked
 
     def check(self, env: Any) -> None:
         """Check that the policy can act in an environment of gym_mara: single, vectorised or wrapped.

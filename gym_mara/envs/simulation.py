@@ -25,7 +25,7 @@ from gym_mara.errors import GymMaraError, finite_numbers, whole_number
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
-from gym_mara.tasks.observation import last_action
+from gym_mara.tasks.observation import PACE, last_action
 from gym_mara.types import Floats, Mask
 
 
@@ -78,6 +78,7 @@ class Simulation:
         if self.task.observes_action:
             parts = [*parts, last_action(self.action_space)]
         self.observation = Observation(parts, self.backend.overshoot)
+        self._pace = self.observation.place(PACE)
         overshoot = self.backend.overshoot
         self._observed_range = (
             asarray(self.robot.lower - overshoot),
@@ -115,7 +116,9 @@ class Simulation:
             q = self._measured_start(noise, arms)
         self.actions.begin(q, mask)
         state.fill_actions(self.actions.action, self.actions.last_action)
-        return self._observe(state, noise), report(state)
+        observation = self._observe(state, noise)
+        self._set_pace(observation)
+        return observation, report(state)
 
     def _draw(self, chosen: Mask) -> None:
         """Draw the random parameters, starts and goals of new episodes.
@@ -136,7 +139,20 @@ class Simulation:
             self._start, position, quaternion = (
                 xp.where(rows, asarray(new), kept) for new, kept in zip(drawn, old, strict=True)
             )
-            self.goal = Goal(position, quaternion)
+            self._set_goals(position, quaternion, chosen)
+
+    def _set_goals(self, position: Floats, quaternion: Floats, chosen: Mask) -> None:
+        """Set the goals (N, …), which are new for the chosen arms (N,), with the configurations that the task needs there."""
+        found = self.task.configurations(
+            self._workspace, host(position)[chosen], host(quaternion)[chosen]
+        )
+        if found is not None:
+            old = self.goal.configurations
+            shape = self.num_envs, *found.shape[1:]
+            all_found = np.full(shape, np.inf) if old is None else host(old).copy()
+            all_found[chosen] = found
+            found = self.backend.asarray(all_found)
+        self.goal = Goal(position, quaternion, found)
 
     def _measured_start(self, noise: Floats, arms: Mask) -> Floats:
         """Where the sensors see the chosen arms (N,) at the start pose: joint positions (N, J), rad."""
@@ -180,6 +196,7 @@ class Simulation:
         if actions.stepping:
             actions.see(state.q if noise is None else self._sensors.q)
         observation = self._observe(state, noise)
+        self._set_pace(observation)
         reward, terms = self._reward(state, observation)
         terminated = self.task.terminated(state, self.goal)
         collided = state.collided
@@ -233,7 +250,8 @@ class Simulation:
             raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
         turn = rotations.canonical(rotations.normalised(turn))
         asarray, shape = self.backend.asarray, (self.num_envs, 1)
-        self.goal = Goal(asarray(np.tile(point, shape)), asarray(np.tile(turn, shape)))
+        everyone = np.ones(self.num_envs, np.bool_)
+        self._set_goals(asarray(np.tile(point, shape)), asarray(np.tile(turn, shape)), everyone)
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.
@@ -269,8 +287,9 @@ class Simulation:
             self._sensors.begin_episodes(self.streams, everyone)
             self._sensors.begin(q, noise, everyone)
             q = self._sensors.q
-        self.actions = self._new_actions()
+        pace, self.actions = self.actions.pace, self._new_actions()
         self.actions.begin(q, None)
+        self.actions.pace = pace
 
     def _new_actions(self) -> Actions:
         return make_actions(
@@ -297,6 +316,13 @@ class Simulation:
             xp = namespace(low)
             state = state.with_q(xp.minimum(xp.maximum(state.q, low), high))
         return self.observation(state, self.goal)
+
+    def _set_pace(self, observation: Floats) -> None:
+        """Note the pace of the next actions from the observations (N, O) to which they respond."""
+        if self._pace is not None:
+            self.actions.pace = namespace(observation).asarray(
+                observation[:, self._pace], copy=True
+            )
 
     def _check_open(self) -> None:
         if self._closed:
@@ -370,7 +396,8 @@ class Simulation:
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         self.outcome = None
-        self.goal = Goal(*(self.backend.asarray(values.copy()) for values in snapshot["goal"]))
+        position, quaternion = (self.backend.asarray(values.copy()) for values in snapshot["goal"])
+        self._set_goals(position, quaternion, np.ones(self.num_envs, np.bool_))
         self._start = self.backend.asarray(snapshot["start"].copy())
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gym_mara.collision.configurations import Configurations
 from gym_mara.collision.free_poses import FreePoses, reachable_pose
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
@@ -22,6 +23,7 @@ class RobotWorkspace:
         self._robot = robot
         self.home = robot.home
         self._free_poses: FreePoses | None = None
+        self._configurations: dict[bool, Configurations] = {}
 
     def draw(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
         """The pose of a random collision-free configuration.
@@ -38,6 +40,13 @@ class RobotWorkspace:
             GymMaraError: almost all configurations of the robot, or all moves from the start, collide.
         """
         return Draw(*self._poses.draw_move(generator, start))
+
+    def configurations(self, position: Floats, quaternion: Floats | None) -> Floats:
+        """Collision-free configurations (N, K, J), rad (m), at N poses or positions; infinite where fewer are found."""
+        posed = quaternion is not None
+        if posed not in self._configurations:
+            self._configurations[posed] = Configurations(self._robot, posed)
+        return self._configurations[posed](position, quaternion)
 
     @property
     def _poses(self) -> FreePoses:

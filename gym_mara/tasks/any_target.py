@@ -30,7 +30,9 @@ _TOLERANCES = {
 }
 _WEIGHTS = {
     "length_per_angle": (1e-3, 10.0, "m/rad", False),
+    "slow_within": (1e-6, 1.0, "m", False),
     "rate_weight": (1e-6, 1e3, "", True),
+    "progress_weight": (1e-6, 1e3, "s/rad", True),
     "collision_weight": (1e-6, 1e6, "", True),
 }
 
@@ -54,20 +56,28 @@ class AnyTargetTask(Task):
     """Whether the target has an orientation."""
     start: str = "random"
     """Where episodes begin: at a "random" collision-free configuration, or at "home"; `start_q` has precedence."""
+    guide: bool = False
+    """Whether the way to the nearest configuration for the target is observed, which inverse kinematics finds."""
     position_tolerance: float = 0.002
     """The largest distance to the target that is a success, m."""
     angle_tolerance: float = np.radians(2.5)
     """The largest angle to the target that is a success, rad; used with `orientation`."""
     length_per_angle: float = 0.2
     """How much an angle counts beside a distance, m/rad."""
+    slow_within: float = 0.02
+    """The error of position and angle together from which steps shrink in proportion to it, m: near the target an action is a
+    part of the way, so that the arm comes to rest there."""
     rate_weight: float = 0.05
     """How much the change of actions costs."""
+    progress_weight: float = 0.1
+    """With `guide`: how much it counts how fast the joint with the longest way to the configuration approaches it, s/rad."""
     collision_weight: float = 100.0
     """How much a collision costs."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "orientation", flag("orientation", self.orientation))
+        for name in ("orientation", "guide"):
+            object.__setattr__(self, name, flag(name, getattr(self, name)))
         one_of("start", self.start, STARTS)
         self._check_ranges(_TOLERANCES, "others say nothing about a success")
         self._check_ranges(_WEIGHTS, "the reward is not accurate with others")
@@ -82,6 +92,13 @@ class AnyTargetTask(Task):
         start = self.start_q if self.start_q is not None else workspace.home
         return workspace.draw_move(generator, np.array(start) if fixed else None)
 
+    def configurations(
+        self, workspace: Workspace, position: Floats, quaternion: Floats
+    ) -> Floats | None:
+        if not self.guide:
+            return None
+        return workspace.configurations(position, quaternion if self.orientation else None)
+
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
         """Joint positions and velocities, the poses of the tool and the target, and the parts of `ArmParts`."""
         from gym_mara.tasks.arm_parts import ArmParts  # which takes long: it needs Pinocchio
@@ -94,15 +111,19 @@ class AnyTargetTask(Task):
             observation.target_position(robot),
         ]
         if self.orientation:
-            parts += [observation.tool_quaternion(), observation.target_quaternion()]
-        own = ArmParts(robot, joint_velocity, self.orientation, self.length_per_angle)
+            parts += [observation.tool_rotation(), observation.target_rotation()]
+        own = ArmParts(
+            robot, joint_velocity, self.orientation, self.length_per_angle, self.slow_within
+        )
+        if self.guide:
+            parts.append(observation.joint_ways_to_configuration(robot))
         return [*parts, *own.parts()]
 
     def reward(self, state: SimState, goal: Goal) -> tuple[Floats, dict[str, Floats]]:
         """How near the tool is to the target, less the costs of the action's change and of a collision; and the terms.
 
         The terms are `distance` and `position_error` (m), `angle_error` (rad), `reward_closeness`, `reward_rate`,
-        `reward_collision`, and `success`.
+        `reward_collision`, with the guide `reward_progress`, and `success`.
         """
         error = state.ee_position - goal.position
         xp, _ = _ONE.like(error)
@@ -119,12 +140,26 @@ class AnyTargetTask(Task):
             change = state.action - state.last_action
             rate = self.rate_weight * xp.mean(change * change, axis=-1)
         collision = self.collision_weight * xp.astype(state.collided, close.dtype)
-        return close - rate - collision, {
+        reward, more = close - rate - collision, {}
+        if self.guide:
+            progress = self.progress_weight * _approach(state, goal)
+            reward, more = reward + progress, {"reward_progress": progress}
+        return reward, {
             "distance": distance,
             "position_error": distance,
             "angle_error": angle,
             "reward_closeness": close,
             "reward_rate": -rate,
             "reward_collision": -collision,
+            **more,
             "success": success & ~state.collided,
         }
+
+
+def _approach(state: SimState, goal: Goal) -> Floats:
+    """The speed (N,), rad/s (m/s), at which the joint with the longest way to the nearest configuration approaches it."""
+    way = goal.ways(state.q)
+    xp, _ = _ONE.like(way)
+    joint = xp.argmax(xp.abs(way), axis=-1)
+    row = xp.arange(len(joint), device=joint.device)
+    return state.qd[row, joint] * xp.sign(way[row, joint])

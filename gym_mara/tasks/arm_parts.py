@@ -15,7 +15,7 @@ from gym_mara.robot.clearance import FAR, Clearance
 from gym_mara.robot.kinematics import JointFrames
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
-from gym_mara.tasks.observation import Part
+from gym_mara.tasks.observation import PACE, Part
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ _CLOSE, _OVERLAP = 0.03, 0.1
 _PUSH, _STRONG = 0.05, 1.0
 """The scales of the direction and of the strength of a repulsion, m/rad."""
 _SMALL = 1e-9
+_AT_LIMIT = 0.01
+"""A joint so near to its limit does not move towards it, rad (m)."""
 
 
 class ArmParts:
@@ -46,12 +48,18 @@ class ArmParts:
         joint_velocity: the largest speed of each joint (J,), rad/s.
         orientation: whether the target has an orientation.
         length_per_angle: how much an angle of the tool counts, m/rad.
+        slow_within: the error of both together from which actions are smaller, m.
     """
 
     def __init__(
-        self, robot: RobotModel, joint_velocity: Floats, orientation: bool, length_per_angle: float
+        self,
+        robot: RobotModel,
+        joint_velocity: Floats,
+        orientation: bool,
+        length_per_angle: float,
+        slow_within: float,
     ) -> None:
-        self._made_of = robot, joint_velocity, orientation, length_per_angle
+        self._made_of = robot, joint_velocity, orientation, length_per_angle, slow_within
         self._joints = robot.num_joints
         self._kinematics, self._clearance = robot.kinematics(), Clearance(robot)
         self._orientation = orientation
@@ -60,6 +68,8 @@ class ArmParts:
         damping = DAMPING**2 * np.eye(len(rows))
         step = STEP_TIME * joint_velocity
         self._constants = Constants(slides, rows[:, None], damping, step, _SMALL, _LEVER)
+        self._limits = Constants(robot.lower + _AT_LIMIT, robot.upper - _AT_LIMIT)
+        self._pace = Constants(length_per_angle, slow_within, 1.0)
         self._scales = Constants(_SCALES, _ANGLE_SCALES, _JOINT_SCALES, _FAR_STEP)
         self._seen: tuple[Any, ...] = (None, None)
 
@@ -84,6 +94,7 @@ class ArmParts:
             _part("joint_steps", 2 * joints, self.joint_steps),
             _part("clearance", 2, self.clearance),
             _part("joint_repulsions", 2 * joints, self.joint_repulsions),
+            Part(PACE, np.zeros(1), np.ones(1), self.pace),
         ]
 
     def position_error_at_scales(self, state: SimState, goal: Goal) -> Floats:
@@ -144,23 +155,33 @@ class ArmParts:
         angle = -2.0 * xp.atan2(along, w) * (size / (size + lever))
         return angle - slides * angle
 
+    def pace(self, state: SimState, goal: Goal) -> Floats:
+        """E / slow_within, at most 1, for the error E of position and angle together (N, 1)."""
+        _, way, turn, _ = self._look(state, goal)
+        xp, length, slow, one = self._pace.like(way)
+        error = xp.sqrt(xp.sum(way * way, axis=-1, keepdims=True))
+        if self._orientation:
+            error = error + length * xp.sqrt(xp.sum(turn * turn, axis=-1, keepdims=True))
+        return xp.minimum(error / slow, one)
+
     def joint_steps(self, state: SimState, goal: Goal) -> Floats:
         """The step of all joints by damped least squares, near and far from the target (N, 2 J).
 
-        δ = Jᵀ (J Jᵀ + λ² I)⁻¹ e (Wampler 1986, doi 10.1109/TSMC.1986.289285). First relative to how far joints travel in
-        STEP_TIME, where a step beyond 1 is shortened as a whole; then δ / (max |δ| + 0.3 rad).
+        δ = Jᵀ (J Jᵀ + λ² I)⁻¹ e (Wampler 1986, doi 10.1109/TSMC.1986.289285), without the joints that it would push against
+        their limits. First relative to how far joints travel in STEP_TIME at the `pace`, where a step beyond 1 is shortened as a
+        whole; then δ / (max |δ| + 0.3 rad).
         """
         frames, way, turn, _ = self._look(state, goal)
-        xp, _, rows, damping, step, _, _ = self._constants.like(way)
+        xp, _, rows, damping, step, small, _ = self._constants.like(way)
         error = xp.concat([way, turn], axis=-1) if self._orientation else way
-        count = error.shape[-1]
-        jacobian = frames.jacobian[:, :count] * rows
+        jacobian = frames.jacobian[:, : error.shape[-1]] * rows
         error = (error * rows[:, 0])[..., None]
-        gram = jacobian @ xp.permute_dims(jacobian, (0, 2, 1)) + damping
-        solved = xp.linalg.solve(gram, error)
-        whole = (xp.permute_dims(jacobian, (0, 2, 1)) @ solved)[..., 0]
+        whole = _least_squares(xp, jacobian, error, damping)
+        _, lowest, highest = self._limits.like(way)
+        blocked = ((state.q < lowest) & (whole < 0.0)) | ((state.q > highest) & (whole > 0.0))
+        whole = _least_squares(xp, jacobian * ~blocked[:, None], error, damping)
         far = whole / (xp.max(xp.abs(whole), axis=-1, keepdims=True) + self._scales.like(whole)[4])
-        near = whole / step
+        near = whole / (step * xp.maximum(self.pace(state, goal), small))
         longest = xp.max(xp.abs(near), axis=-1, keepdims=True)
         near = near / xp.where(longest > 1.0, longest, xp.ones_like(longest))
         return xp.concat([near, far], axis=-1)
@@ -201,6 +222,12 @@ class ArmParts:
         """The least distance (N,), m, and the repulsion (N, J)."""
         self._look(state, goal)
         return self._seen[3]  # type: ignore[no-any-return]
+
+
+def _least_squares(xp: Any, jacobian: Floats, error: Floats, damping: Floats) -> Floats:
+    """The damped step (N, J) for errors (N, K, 1) with Jacobians (N, K, J) and the damping (K, K)."""
+    across = xp.permute_dims(jacobian, (0, 2, 1))
+    return (across @ xp.linalg.solve(jacobian @ across + damping, error))[..., 0]  # type: ignore[no-any-return]
 
 
 def _at_scales(xp: Any, values: Floats, size: Floats, scales: Floats) -> Floats:

@@ -50,6 +50,9 @@ class Workspace(Protocol):
         No collision is on the straight joint move from the one to the other.
         """
 
+    def configurations(self, position: Floats, quaternion: Floats | None) -> Floats:
+        """Collision-free configurations (N, K, J), rad (m), at N poses; infinite where fewer are found."""
+
     def default_pose(self) -> tuple[Floats, Floats]:
         """The pose of a collision-free configuration, always the same for a robot."""
 
@@ -145,6 +148,18 @@ class Task(ABC):
         Environments call this method only if `random_goal` is true.
         """
         return Draw(None, *self.draw_goal(workspace, generator))
+
+    def configurations(
+        self, workspace: Workspace, position: Floats, quaternion: Floats
+    ) -> Floats | None:
+        """The configurations (N, K, J) at goals that the observation or the reward needs; None by default.
+
+        Args:
+            workspace: the poses that the arm can reach.
+            position: of the goals (N, 3), m.
+            quaternion: of the goals (N, 4), [w, x, y, z].
+        """
+        return None
 
     @abstractmethod
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:

@@ -18,6 +18,21 @@ class Goal:
     """Positions (N, 3), m."""
     quaternion: Floats
     """Quaternions (N, 4), [w, x, y, z]."""
+    configurations: Floats | None = None
+    """Configurations of the arm at the goals (N, K, J), rad (m), infinite where there are fewer; None if the task needs none."""
+
+    def ways(self, q: Floats) -> Floats:
+        """The way (N, J), rad (m), from configurations q (N, J) to the nearest one at the goal; zero if none is known.
+
+        The nearest one is that whose farthest joint has the shortest way. Collisions on the way are not considered.
+        """
+        xp = namespace(q)
+        if self.configurations is None:
+            return xp.zeros_like(q)
+        ways = self.configurations - q[:, None]
+        nearest = xp.argmin(xp.max(xp.abs(ways), axis=-1), axis=-1)
+        way = ways[xp.arange(len(nearest), device=nearest.device), nearest]
+        return xp.where(xp.isfinite(way), way, xp.zeros_like(way))
 
     @cached_property
     def _inverse(self) -> Floats:

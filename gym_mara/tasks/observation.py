@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium.spaces import Box
 
-from gym_mara.arrays import namespace
+from gym_mara import rotations
+from gym_mara.arrays import Constants, namespace
 from gym_mara.errors import GymMaraError
 from gym_mara.state import SimState
 from gym_mara.tasks.goal import Goal
@@ -44,6 +45,13 @@ class Part:
     unit: str = ""
     """The unit of the values, such as "m/s"; "joint" for that of each joint, rad (m), "joint/s" for that of its
     velocity, and "" for none. Exported policies name it."""
+
+
+_WAYS = Constants(0.3, 2.0)
+"""The scales of a way to a configuration, rad (m)."""
+
+PACE = "pace"
+"""The name of the part, in [0, 1], by which actions that are steps are multiplied, if an observation has it."""
 
 
 class Observation:
@@ -81,6 +89,13 @@ class Observation:
         """Compute the flat observations (N, O) of N arms, a fresh array."""
         parts = [values(state, goal) for values in self._values]
         return namespace(state.q).concat(parts, axis=-1)
+
+    def place(self, name: str) -> slice | None:
+        """Where the part with a name is in flat observations; None without such a part."""
+        for part, end in zip(self.parts, self._ends, strict=True):
+            if part.name == name:
+                return slice(end - len(part.low), end)
+        return None
 
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""
@@ -162,6 +177,11 @@ def tool_quaternion() -> Part:
     return _quaternion("tool_quaternion", _tool_quaternion)
 
 
+def tool_rotation() -> Part:
+    """The orientation of the end effector in the world frame as a rotation matrix, row by row (9,)."""
+    return _rotation("tool_rotation", _tool_rotation)
+
+
 def target_position(robot: RobotModel) -> Part:
     """The position of the target in the world frame (3,), m, for targets within reach."""
     return _symmetric("target_position", robot.extent, _target_position, "m")
@@ -172,6 +192,20 @@ def target_quaternion() -> Part:
     return _quaternion("target_quaternion", _target_quaternion)
 
 
+def target_rotation() -> Part:
+    """The orientation of the target in the world frame as a rotation matrix, row by row (9,).
+
+    Points of the tool at the target are linear in it, and quadratic in a quaternion: a network learns more easily from it.
+    """
+    return _rotation("target_rotation", _target_rotation)
+
+
+def joint_ways_to_configuration(robot: RobotModel) -> Part:
+    """The way δ to the nearest known configuration at the target, as δ / max(max |δ|, 0.3) and δ / (max |δ| + 2) (2 J)."""
+    bound = np.ones(2 * robot.num_joints)
+    return Part("joint_ways_to_configuration", -bound, bound, _joint_ways_to_configuration)
+
+
 def _symmetric(
     name: str, bound: float, values: Callable[[SimState, Goal], Floats], unit: str
 ) -> Part:
@@ -180,6 +214,10 @@ def _symmetric(
 
 def _quaternion(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:
     return Part(name, np.array([0.0, -_ONE, -_ONE, -_ONE]), np.full(4, _ONE), values)
+
+
+def _rotation(name: str, values: Callable[[SimState, Goal], Floats]) -> Part:
+    return Part(name, np.full(9, -_ONE), np.full(9, _ONE), values)
 
 
 def _joint_positions(state: SimState, goal: Goal) -> Floats:
@@ -193,6 +231,13 @@ def _joint_cosines_and_sines(state: SimState, goal: Goal) -> Floats:
 
 def _joint_velocities(state: SimState, goal: Goal) -> Floats:
     return state.qd
+
+
+def _joint_ways_to_configuration(state: SimState, goal: Goal) -> Floats:
+    way = goal.ways(state.q)
+    xp, near, far = _WAYS.like(way)
+    longest = xp.max(xp.abs(way), axis=-1, keepdims=True)
+    return xp.concat([way / xp.maximum(longest, near), way / (longest + far)], axis=-1)
 
 
 def _last_action(state: SimState, goal: Goal) -> Floats:
@@ -218,6 +263,14 @@ def _tool_position(state: SimState, goal: Goal) -> Floats:
 
 def _tool_quaternion(state: SimState, goal: Goal) -> Floats:
     return state.ee_quaternion
+
+
+def _tool_rotation(state: SimState, goal: Goal) -> Floats:
+    return rotations.to_matrix(state.ee_quaternion).reshape(-1, 9)
+
+
+def _target_rotation(state: SimState, goal: Goal) -> Floats:
+    return rotations.to_matrix(goal.quaternion).reshape(-1, 9)
 
 
 def _target_position(state: SimState, goal: Goal) -> Floats:

@@ -24,6 +24,10 @@ ARRAY = (
     Part("joint_positions", 3, "joint", "observation"),
     Part("position_error", 2, "m", "observation"),
 )
+PACED = (
+    Part("joint_positions", 3, "joint", "observation"),
+    Part("pace", 1, "", "observation"),
+)
 GROUPS = (
     Part("joint_positions", 3, "joint", "observation"),
     Part("target_position", 2, "m", "desired_goal"),

@@ -24,6 +24,7 @@ from tests.deploy.models import (
     ARRAY,
     FROM_TARGET,
     GROUPS,
+    PACED,
     RELATIVE,
     TWIST,
     about,
@@ -183,6 +184,24 @@ def test_relative_actions_may_start_from_the_last_target(tmp_path: Path) -> None
     assert_allclose(own.targets([1.0] * 3, Q, [0.52, 0.2, 1.3]), [0.53, 0.201, 1.8])
     with pytest.raises(GymMaraError, match="start from the last targets: give last_target"):
         own.targets([0.5] * 3, Q)
+
+
+def test_steps_are_multiplied_by_the_pace_of_the_observation(tmp_path: Path) -> None:
+    own, steps = policy(tmp_path, RELATIVE, PACED), np.array(RELATIVE.steps)
+    assert_allclose(
+        own.targets([1.0, -1.0, 0.5], Q, pace=[0.1]), Q + 0.1 * steps * [1.0, -1.0, 0.5]
+    )
+    assert_allclose(own.targets([1.0] * 3, Q, pace=[3.0]), own.targets([1.0] * 3, Q, pace=[1.0]))
+    both = own.targets(np.ones((2, 3)), np.stack([Q, Q]), pace=[[0.5], [1.0]])
+    assert_allclose(both, [Q + 0.5 * steps, Q + steps])
+    for pace, message in (
+        (None, "steps are multiplied by the observation's part 'pace': give it as pace"),
+        ([0.1, 0.2], "pace"),
+        ([[0.1], [0.2]], "must have one row for each arm"),
+        ([np.nan], "pace"),
+    ):
+        with pytest.raises(GymMaraError, match=message):
+            own.targets([1.0] * 3, Q, pace=pace)
 
 
 def test_targets_of_many_arms(tmp_path: Path) -> None:

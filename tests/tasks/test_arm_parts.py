@@ -20,6 +20,9 @@ from gym_mara.testing import pickled, uniform_q
 from gym_mara.types import Floats
 from tests.helpers import robot_model, write
 
+SLOW = 0.02
+"""The error within which actions slow down, m."""
+
 # A carriage on a rail with two more joints, one of them along a slanted axis.
 SLIDER = """
 <robot name="slider">
@@ -64,7 +67,7 @@ def _scene(robot: RobotModel, count: int = 30) -> tuple[SimState, Goal]:
 
 
 def _parts(robot: RobotModel, orientation: bool = True) -> ArmParts:
-    return ArmParts(robot, robot.velocity_limit, orientation, 0.2)
+    return ArmParts(robot, robot.velocity_limit, orientation, 0.2, SLOW)
 
 
 def test_no_other_angle_of_a_joint_brings_the_tool_nearer(robot: RobotModel) -> None:

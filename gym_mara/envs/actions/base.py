@@ -59,9 +59,12 @@ class Actions(ABC):
         self._prepare(backend)
         zeros = self._asarray(np.zeros((backend.num_envs, *self.space.shape)))
         self.action: Floats = zeros
-        """The last action of each arm (N, A), clipped to the action space, and zero at the start of an episode."""
+        """The last action of each arm (N, A), clipped to the action space and slowed down by its pace; zero at the start of an
+        episode."""
         self.last_action: Floats = zeros
         """The action before it (N, A)."""
+        self.pace: Floats = self._asarray(np.ones((backend.num_envs, 1)))
+        """What the next actions are multiplied by (N, 1), in [0, 1], where they are steps: the observation's part `pace`."""
 
     @abstractmethod
     def _prepare(self, backend: Backend) -> None:
@@ -103,7 +106,8 @@ class Actions(ABC):
 
     def save(self) -> dict[str, Any]:
         """A snapshot of the last actions, in NumPy's arrays."""
-        return {name: np.array(host(getattr(self, name))) for name in ("action", "last_action")}
+        names = "action", "last_action", "pace"
+        return {name: np.array(host(getattr(self, name))) for name in names}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot of the same form."""

@@ -80,7 +80,8 @@ class SteppingActions(Actions):
     def targets(self, action: Any) -> Floats:
         given = self._checked(action, "action", self.action.shape)
         xp, one = _ONE.like(given)
-        self.last_action, self.action = self.action, xp.minimum(xp.maximum(given, -one), one)
+        clipped = xp.minimum(xp.maximum(given, -one), one)
+        self.last_action, self.action = self.action, clipped * self.pace
         return self._aimed(self._clipped(self.origin + self._way(self.action * self._scale)))
 
     def override(self, q_target: Any) -> Floats:
