@@ -133,3 +133,10 @@ def test_the_result_of_a_row_does_not_depend_on_the_batch() -> None:
         )
         for all_rows, one_row in zip(batch, single, strict=True):
             np.testing.assert_allclose(all_rows[one], one_row, rtol=0.0, atol=1e-15)
+
+
+@given(quaternions)
+def test_a_matrix_is_that_of_pinocchio_and_leads_back(q: Floats) -> None:
+    (matrix,) = rotations.to_matrix(q[None])
+    np.testing.assert_allclose(matrix, _matrix(q), rtol=0.0, atol=1e-12)
+    assert _same_rotation(rotations.from_matrix(matrix[None])[0], rotations.canonical(q))

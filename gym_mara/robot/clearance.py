@@ -72,7 +72,11 @@ class Clearance:
         difference[pairs, one], difference[pairs, other] = 1.0, -1.0
         reach = spheres.radius[one] + spheres.radius[other]
         self._pairs = Constants(difference, reach[:, None])
+        bodies = np.array(spheres.body)
+        ends = np.stack([bodies[one], bodies[other]], axis=1)
+        self._of_pairs = _members(ends, robot.num_joints)
         self._boxes: list[Constants] = []
+        self._of_boxes: list[Members] = []
         for shape, (rotation, position, half) in _boxes(robot).items():
             against = np.flatnonzero(allowed[shape, shapes])
             distance = _from_box(np, placed[against], rotation, position[:, None], half[:, None])[1]
@@ -83,26 +87,31 @@ class Clearance:
                 self._boxes.append(
                     Constants(select, rotation, position[:, None], half[:, None], radius)
                 )
+                self._of_boxes.append(_members(bodies[near, None], robot.num_joints))
         outer = np.array(spheres.body)[None] >= np.arange(robot.num_joints)[:, None]
         slides = robot.kinematics().prismatic.astype(np.float64)[:, None]
         self._joints = Constants(outer.astype(np.float64), slides, FAR, WIDTH)
 
     def __call__(self, frames: JointFrames) -> tuple[Floats, Floats]:
-        """The least distance, and the repulsion, of N arms.
+        """The least distance of each body, and the repulsion, of N arms.
 
         Args:
             frames: of `Kinematics.joint_frames`.
 
         Returns:
-            The least distance (N,), m, at most FAR, negative where spheres overlap; and -∂U/∂q (N, J) of the potential
+            The least distance of the body that each joint moves (N, J), m, at most FAR, negative where spheres overlap; and -∂U/∂q (N, J) of the potential
             U = Σ w e^(-d/w) over all pairs with distance d, with w = WIDTH: to follow it leads away from the nearest pairs.
         """
         xp, outer, slides, far, width = self._joints.like(frames.position)
         centre = self._placed(frames)
         spheres, _, count = centre.shape
-        least, force = xp.zeros_like(centre[0, 0]) + far, xp.zeros_like(centre)
-        for spread, apart, length, distance in self._groups(xp, centre):
-            least = xp.minimum(least, xp.min(distance, axis=0))
+        least = [xp.zeros_like(centre[0, 0]) + far] * len(outer)
+        force = xp.zeros_like(centre)
+        members = [self._of_pairs] if self._of_pairs else []
+        groups = zip([*members, *self._of_boxes], self._groups(xp, centre), strict=True)
+        for of_bodies, (spread, apart, length, distance) in groups:
+            for body, own in of_bodies.items():
+                least[body] = xp.minimum(least[body], xp.min(distance[own], axis=0))
             push = apart * (xp.exp(-distance / width) / length)[:, None]
             force = force + (spread @ push.reshape(len(push), -1)).reshape(spheres, 3, count)
         # The virtual work of the forces on all that a joint moves: their sum along its axis, or their moment about it.
@@ -112,7 +121,9 @@ class Clearance:
             for each in (force, moment)
         )
         about = turn - xp.linalg.cross(frames.origins, total)
-        return least, xp.sum(frames.axes * (about + slides * (total - about)), axis=-1)
+        return xp.stack(least, axis=-1), xp.sum(
+            frames.axes * (about + slides * (total - about)), axis=-1
+        )
 
     def _groups(self, xp: Any, centre: Floats) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
         """The pairs of spheres, then those of spheres with each box.
@@ -150,6 +161,16 @@ class Clearance:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._robot,)
+
+
+Members = dict[int, list[int]]
+"""The pairs of each body that has any."""
+
+
+def _members(bodies: NDArray[np.intp], joints: int) -> Members:
+    """The pairs of each body, for the bodies of each pair (P, 1) or (P, 2)."""
+    found = {body: np.flatnonzero((bodies == body).any(axis=1)).tolist() for body in range(joints)}
+    return {body: pairs for body, pairs in found.items() if pairs}
 
 
 def _from_box(

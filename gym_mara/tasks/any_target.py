@@ -69,7 +69,7 @@ class AnyTargetTask(Task):
     part of the way, so that the arm comes to rest there."""
     rate_weight: float = 0.05
     """How much the change of actions costs."""
-    progress_weight: float = 0.1
+    progress_weight: float = 0.4
     """With `guide`: how much it counts how fast the joint with the longest way to the configuration approaches it, s/rad."""
     collision_weight: float = 100.0
     """How much a collision costs."""

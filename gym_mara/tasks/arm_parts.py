@@ -92,7 +92,7 @@ class ArmParts:
         return [
             *parts,
             _part("joint_steps", 2 * joints, self.joint_steps),
-            _part("clearance", 2, self.clearance),
+            _part("clearance", 2 * joints, self.clearance),
             _part("joint_repulsions", 2 * joints, self.joint_repulsions),
             Part(PACE, np.zeros(1), np.ones(1), self.pace),
         ]
@@ -187,10 +187,13 @@ class ArmParts:
         return xp.concat([near, far], axis=-1)
 
     def clearance(self, state: SimState, goal: Goal) -> Floats:
-        """The least distance d of links that may collide, by `gym_mara.robot.clearance` (N, 2): d / FAR, and e^(-(d + 0.1)/0.03)."""
+        """The least distance d of each body from those that it may touch, by `gym_mara.robot.clearance` (N, 2 J).
+
+        As d / FAR, and e^(-(d + 0.1)/0.03).
+        """
         least, _ = self._nearness(state, goal)
         xp = self._constants.like(least)[0]
-        return xp.stack([least / FAR, xp.exp(-(least + _OVERLAP) / _CLOSE)], axis=-1)
+        return xp.concat([least / FAR, xp.exp(-(least + _OVERLAP) / _CLOSE)], axis=-1)
 
     def joint_repulsions(self, state: SimState, goal: Goal) -> Floats:
         """Which way each joint leads away from collisions, and how strongly (N, 2 J), from -1 to 1.
@@ -219,7 +222,7 @@ class ArmParts:
         return self._seen[2]  # type: ignore[no-any-return]
 
     def _nearness(self, state: SimState, goal: Goal) -> tuple[Floats, Floats]:
-        """The least distance (N,), m, and the repulsion (N, J)."""
+        """The least distances of the bodies (N, J), m, and the repulsion (N, J)."""
         self._look(state, goal)
         return self._seen[3]  # type: ignore[no-any-return]
 

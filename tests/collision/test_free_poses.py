@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gym_mara.collision import make_checker
-from gym_mara.collision.free_poses import FreePoses, reachable_pose
+from gym_mara.collision.free_poses import ROOM, FreePoses, reachable_pose
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.catalog import robot_names
@@ -60,6 +60,8 @@ def test_a_robot_that_always_collides_is_an_error(tmp_path: Path) -> None:
 def test_a_random_move_is_free_from_its_start_to_its_pose() -> None:
     mara = robot_model("mara")
     poses, checker = FreePoses(mara), make_checker("coal", mara)
+    with_room = checker.with_margin(np.full(6, ROOM))
+    assert with_room is not None
     collided = 0
     for seed in range(30):
         start, position, quaternion = poses.draw_move(np.random.default_rng(seed))
@@ -73,6 +75,7 @@ def test_a_random_move_is_free_from_its_start_to_its_pose() -> None:
         fine = start + np.linspace(0.0, 1.0, 1001)[:, None] * (end - start)
         touched = checker.check(fine)
         assert not touched[[0, -1]].any()
+        assert not with_room.check(fine[[0, -1]]).any()
         collided += int(touched.sum())
     # Between two checks the arm may graze itself: at most in a few of 30,000 configurations.
     assert collided < 30

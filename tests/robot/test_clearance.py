@@ -18,13 +18,24 @@ ROBOTS = ("mara", "ur5", "panda")
 def test_the_clearance_tells_most_collisions_from_free_configurations(robot: str) -> None:
     arm = robot_model(robot)
     q = uniform_q(arm, 1000, seed=0)
-    distance, _ = Clearance(arm)(arm.kinematics().joint_frames(q))
+    bodies, _ = Clearance(arm)(arm.kinematics().joint_frames(q))
+    distance = bodies.min(axis=1)
     collided = make_checker("coal", arm).check(q)
     assert (distance <= FAR).all()
     # The spheres of MARA, made of cylinders and boxes, follow it more closely than those of meshes.
     found, wrong = {"mara": (0.93, 0.01), "ur5": (0.95, 0.08), "panda": (0.93, 0.12)}[robot]
     assert (distance[collided] < 0.0).mean() > found
     assert (distance[~collided] < 0.0).mean() < wrong
+
+
+def test_two_bodies_that_are_nearest_have_the_same_distance_and_others_a_larger_one() -> None:
+    arm = robot_model("mara")
+    distance, _ = Clearance(arm)(arm.kinematics().joint_frames(uniform_q(arm, 300, seed=4)))
+    assert distance.shape == (300, 6)
+    ascending = np.sort(distance, axis=1)
+    against_a_fixed_shape = ascending[:, 1] > ascending[:, 0]
+    assert 0.05 < against_a_fixed_shape.mean() < 0.95
+    assert (ascending[:, -1] > ascending[:, 1]).mean() > 0.9
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

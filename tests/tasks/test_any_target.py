@@ -76,6 +76,21 @@ def test_the_terms_add_up_with_their_weights() -> None:
     assert reward == pytest.approx(sum(float(terms[name][0]) for name in parts))
 
 
+def test_with_a_guide_the_joint_with_the_longest_way_is_rewarded_for_its_speed() -> None:
+    task = AnyTargetTask(guide=True, progress_weight=2.0)
+    ways = np.array([0.1, -0.9, 0.3, 0.0, 0.0, 0.0])
+    others = np.full(6, np.inf), np.full(6, 1.5)
+    goal = Goal(*dataclasses.astuple(ORIGIN)[:2], np.stack([others[0], ways, others[1]])[None])
+    speed = np.array([[0.7, -0.25, 0.1, 0.0, 0.0, 0.0]])
+    _, terms = task.reward(_at(qd=speed), goal)
+    assert terms["reward_progress"].tolist() == [2.0 * 0.25]
+    _, terms = task.reward(_at(qd=-speed), goal)
+    assert terms["reward_progress"].tolist() == [-2.0 * 0.25]
+    nowhere = Goal(goal.position, goal.quaternion, np.full((1, 2, 6), np.inf))
+    _, terms = task.reward(_at(qd=speed), nowhere)
+    assert terms["reward_progress"].tolist() == [0.0]
+
+
 @pytest.mark.parametrize(
     ("distance", "angle", "position", "pose"),
     [
@@ -110,6 +125,9 @@ def test_success_is_within_the_tolerances_and_without_a_collision(
         ("length_per_angle", 0.0, "length_per_angle must be"),
         ("rate_weight", -1.0, "rate_weight must be"),
         ("collision_weight", np.inf, "collision_weight must be"),
+        ("slow_within", 0.0, "slow_within must be"),
+        ("progress_weight", -0.1, "progress_weight must be"),
+        ("guide", 1, "guide must be"),
     ],
 )
 def test_a_wrong_value_is_an_error(option: str, value: Any, message: str) -> None:

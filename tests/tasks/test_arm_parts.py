@@ -57,7 +57,7 @@ def _state(robot: RobotModel, q: Floats) -> SimState:
 
 
 def _least_distance(mara: RobotModel, q: Floats) -> Floats:
-    return Clearance(mara)(mara.kinematics().joint_frames(q))[0]
+    return Clearance(mara)(mara.kinematics().joint_frames(q))[0].min(axis=1)
 
 
 def _scene(robot: RobotModel, count: int = 30) -> tuple[SimState, Goal]:
@@ -136,6 +136,32 @@ def test_joint_steps_are_the_damped_least_squares_of_pinocchios_jacobian(
         np.testing.assert_allclose(steps[arm], [*near, *far], atol=1e-6)
 
 
+def test_joint_steps_do_not_push_against_a_limit(robot: RobotModel) -> None:
+    state, goal = _scene(robot)
+    count = robot.num_joints
+    free = _parts(robot).joint_steps(state, goal)[:, :count]
+    joint = np.abs(free).argmax(axis=1)
+    rows = np.arange(len(free))
+    q = state.q.copy()
+    limits = np.where(free[rows, joint] > 0.0, robot.upper[joint], robot.lower[joint])
+    q[rows, joint] = limits
+    pushed = _parts(robot).joint_steps(_state(robot, q), goal)[:, :count]
+    outward = pushed[rows, joint] * np.sign(limits - 0.5 * (robot.lower + robot.upper)[joint])
+    assert (outward <= 0.0).all()
+    assert np.abs(pushed).max(axis=1).min() > 0.0
+
+
+def test_the_pace_is_the_error_relative_to_the_distance_of_slowing_down(robot: RobotModel) -> None:
+    there = _state(robot, uniform_q(robot, 30, seed=1))
+    for away, angle, expected in ((0.3, 0.0, 1.0), (0.005, 0.0, 0.25), (0.003, 0.01, 0.25)):
+        turn = np.array([[np.cos(angle / 2.0), 0.0, np.sin(angle / 2.0), 0.0]])
+        goal = Goal(
+            there.ee_position + [0.0, away, 0.0], rotations.multiply(turn, there.ee_quaternion)
+        )
+        pace = _parts(robot).pace(there, goal)
+        np.testing.assert_allclose(pace, np.full((30, 1), expected), atol=1e-6)
+
+
 def test_all_parts_stay_in_their_bounds_at_the_target_and_everywhere(robot: RobotModel) -> None:
     state, goal = _scene(robot)
     there = _state(robot, uniform_q(robot, 30, seed=1))
@@ -157,8 +183,8 @@ def test_clearance_and_repulsion_tell_near_from_far() -> None:
     least = _least_distance(mara, q)
     order = np.argsort(least)
     near = parts.clearance(state, goal)[order]
-    assert (np.diff(near[:, 0]) >= 0.0).all()
-    assert (np.diff(near[:, 1]) <= 0.0).all()
+    assert (np.diff(near[:, :6].min(axis=1)) >= 0.0).all()
+    assert (np.diff(near[:, 6:].max(axis=1)) <= 0.0).all()
     strength = np.abs(parts.joint_repulsions(state, goal)[:, 6:]).max(axis=1)
     assert strength[order[0]] > 2.0 * strength[order[-1]]
 

@@ -46,19 +46,20 @@ _TRAVELLING = Preset(
         },
     },
 )
-# Many arms with random targets, and many short updates. An action is rewarded within half a second.
+# Many arms with random targets, and many short updates. An action is rewarded within a second. The standard deviation begins
+# wide: with 0.2 instead of 0.6 the policy was ten times as far off after a million steps.
 _ANY_TARGET = Preset(
     num_envs=512,
     normalise_observation=True,
     arguments={
         "n_steps": 16,
         "batch_size": 2048,
-        "n_epochs": 5,
+        "n_epochs": 3,
         "gamma": 0.98,
         "gae_lambda": 0.95,
         "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
         "clip_range": 0.2,
-        "policy_kwargs": {"net_arch": [256, 256], "log_std_init": -1.5, "activation_fn": "ReLU"},
+        "policy_kwargs": {"net_arch": [256, 256], "log_std_init": -0.5, "activation_fn": "ReLU"},
     },
 )
 _PAPER = Preset(
