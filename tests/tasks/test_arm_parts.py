@@ -156,7 +156,8 @@ def test_the_pace_is_the_error_relative_to_the_distance_of_slowing_down(robot: R
     for away, angle, expected in ((0.3, 0.0, 1.0), (0.005, 0.0, 0.25), (0.003, 0.01, 0.25)):
         turn = np.array([[np.cos(angle / 2.0), 0.0, np.sin(angle / 2.0), 0.0]])
         goal = Goal(
-            there.ee_position + [0.0, away, 0.0], rotations.multiply(turn, there.ee_quaternion)
+            there.ee_position + np.array([0.0, away, 0.0]),
+            rotations.multiply(turn, there.ee_quaternion),
         )
         pace = _parts(robot).pace(there, goal)
         np.testing.assert_allclose(pace, np.full((30, 1), expected), atol=1e-6)
