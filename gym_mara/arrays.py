@@ -52,6 +52,11 @@ def zeros_like(array: Array) -> Array:
     return namespace(array).zeros_like(array)
 
 
+def like(values: NDArray[Any], array: Array) -> Array:
+    """Floats of NumPy as an array of the library, the float type and the device of another array."""
+    return _tensor(values, array.dtype, array.device) if is_tensor(array) else values
+
+
 class Constants:
     """Fixed values, as arrays of the library, the float type and the device of another array.
 

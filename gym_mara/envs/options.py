@@ -12,7 +12,7 @@ from typing import Any
 from gym_mara.backends import backend_names, backend_settings
 from gym_mara.envs.actions import ActionSettings
 from gym_mara.envs.sensors import SensorSettings
-from gym_mara.errors import GymMaraError, unknown
+from gym_mara.errors import GymMaraError, one_of, unknown
 from gym_mara.rendering import RenderSettings
 from gym_mara.robot import RobotLike, RobotModel, RobotOptions
 from gym_mara.tasks import Task, named_task
@@ -124,9 +124,9 @@ def check_reset_options(options: Any, known: Sequence[str]) -> None:
     if not isinstance(options, Mapping):
         raise GymMaraError(f"the options of reset must be a dictionary or None, not {options!r}")
     for key in options:
-        if key not in known:
-            valid = f"the only one is {known[0]!r}" if known else "this environment has none"
-            raise GymMaraError(f"unknown option of reset {key!r}: {valid}")
+        if not known:
+            raise GymMaraError(f"unknown option of reset {key!r}: this environment has none")
+        one_of("option of reset", key, known)
 
 
 def _names(form: Any) -> list[str]:

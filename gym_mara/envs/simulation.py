@@ -11,17 +11,17 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.spaces import Box, Space
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara import rotations
 from gym_mara.arrays import host, namespace, zeros_like
 from gym_mara.backends import backend_settings, make_backend
 from gym_mara.envs.actions import Actions, make_actions
+from gym_mara.envs.episodes import Episodes
+from gym_mara.envs.given import Given
 from gym_mara.envs.options import Options
 from gym_mara.envs.outcome import Outcome, report
 from gym_mara.envs.sensors import Sensors, check_noise, noise_of
 from gym_mara.envs.statistics import EpisodeStatistics
-from gym_mara.envs.streams import Streams, check_streams, drawn_episodes, parameter_seeds
-from gym_mara.envs.workspace import RobotWorkspace
-from gym_mara.errors import GymMaraError, finite_numbers, whole_number
+from gym_mara.envs.streams import Streams, check_streams, parameter_seeds
+from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
@@ -50,14 +50,11 @@ class Simulation:
         self.options = options
         self.backend_name = options.backend
         self.backend = make_backend(options.backend, self.robot, self.num_envs, options.settings)
-        self._workspace = RobotWorkspace(self.robot)
         asarray = self.backend.asarray
-        goal = self.task.goal(self.robot, self._workspace, self.num_envs)
-        self.goal = Goal(asarray(goal.position), asarray(goal.quaternion))
-        start = self.robot.home if self.task.start_q is None else self.task.start_q
-        self._start = asarray(np.tile(self.robot.checked_q(start, "start_q"), (self.num_envs, 1)))
+        self.episodes = Episodes(self.task, self.robot, self.num_envs, asarray)
+        """The start and the goal of each arm."""
         # A tensor of the backend's type and device; None with NumPy's arrays.
-        self._tensor = None if self.backend.arrays == "numpy" else self._start
+        self._tensor = None if self.backend.arrays == "numpy" else self.episodes.start
         self._started = False
         self._closed = False
         self.outcome: Outcome | None = None
@@ -74,7 +71,9 @@ class Simulation:
         """What actions mean, and the last ones."""
         self.action_space: Box[np.float32] = self.actions.space
         """The space of one arm's actions."""
-        parts = self.task.observation(self.robot, goal, self.backend.joint_velocity)
+        parts = self.task.observation(
+            self.robot, self.episodes.first_goal, self.backend.joint_velocity
+        )
         if self.task.observes_action:
             parts = [*parts, last_action(self.action_space)]
         self.observation = Observation(parts, self.backend.overshoot)
@@ -90,25 +89,39 @@ class Simulation:
         self.target_low, self.target_high = self.actions.target_low, self.actions.target_high
 
     @property
+    def goal(self) -> Goal:
+        """The goal of each arm."""
+        return self.episodes.goal
+
+    @property
     def random(self) -> bool:
         """Whether episodes have random parameters or goals, so that `reset` needs `streams`."""
         return self.backend.random or self.task.random_goal
 
-    def reset(self, mask: Mask | None = None) -> tuple[Floats, dict[str, NDArray[Any]]]:
+    def reset(
+        self, mask: Mask | None = None, given: Given | None = None
+    ) -> tuple[Floats, dict[str, NDArray[Any]]]:
         """Begin new episodes of all arms, or of the arms that the mask (N,) selects.
+
+        Args:
+            mask: in the backend's arrays.
+            given: what the task does not draw, from `Episodes.given`.
 
         Returns:
             The observations (N, O); and torques, contacts and random parameters, each (N, …), if the state has them.
         """
         self._check_open()
-        if self.random:
-            self._draw(np.ones(self.num_envs, np.bool_) if mask is None else host(mask))
-        self.backend.reset(self._start, mask)
+        self.episodes.begin(self.streams, mask, given)
+        start = self.episodes.start
+        if self.backend.random:
+            arms = np.ones(self.num_envs, np.bool_) if mask is None else host(mask)
+            self.backend.begin_episodes(parameter_seeds(self.streams, arms), arms)
+        self.backend.reset(start, mask)
         chosen = slice(None) if mask is None else mask
         self.statistics.clear(chosen)
         self._started = True
         self._began[chosen] = True
-        state, q = self.backend.state, self._start
+        state, q = self.backend.state, start
         noise = noise_of(state)
         if noise is not None:
             arms = np.ones(self.num_envs, np.bool_) if mask is None else mask
@@ -120,43 +133,9 @@ class Simulation:
         self._set_pace(observation)
         return observation, report(state)
 
-    def _draw(self, chosen: Mask) -> None:
-        """Draw the random parameters, starts and goals of new episodes.
-
-        The mask (N,) is NumPy's, because each arm has its own generators.
-        """
-        if self.backend.random:
-            self.backend.begin_episodes(parameter_seeds(self.streams, chosen), chosen)
-        if self.task.random_goal:
-            drawn = drawn_episodes(
-                self.task, self._workspace, self.streams, chosen, host(self._start)
-            )
-            asarray, old = (
-                self.backend.asarray,
-                (self._start, self.goal.position, self.goal.quaternion),
-            )
-            xp, rows = namespace(self._start), asarray(chosen)[:, None]
-            self._start, position, quaternion = (
-                xp.where(rows, asarray(new), kept) for new, kept in zip(drawn, old, strict=True)
-            )
-            self._set_goals(position, quaternion, chosen)
-
-    def _set_goals(self, position: Floats, quaternion: Floats, chosen: Mask) -> None:
-        """Set the goals (N, …), which are new for the chosen arms (N,), with the configurations that the task needs there."""
-        found = self.task.configurations(
-            self._workspace, host(position)[chosen], host(quaternion)[chosen]
-        )
-        if found is not None:
-            old = self.goal.configurations
-            shape = self.num_envs, *found.shape[1:]
-            all_found = np.full(shape, np.inf) if old is None else host(old).copy()
-            all_found[chosen] = found
-            found = self.backend.asarray(all_found)
-        self.goal = Goal(position, quaternion, found)
-
     def _measured_start(self, noise: Floats, arms: Mask) -> Floats:
         """Where the sensors see the chosen arms (N,) at the start pose: joint positions (N, J), rad."""
-        self._sensors.begin(self._start, noise, arms)
+        self._sensors.begin(self.episodes.start, noise, arms)
         return self._sensors.q
 
     def step(self, action: ArrayLike) -> Outcome:
@@ -186,7 +165,8 @@ class Simulation:
 
     def _move_to(self, q_target: Floats) -> Outcome:
         """Move every arm towards joint targets (N, J) for one control period, and judge the result."""
-        xp = namespace(self._start)
+        start = self.episodes.start
+        xp = namespace(start)
         state, actions = self.backend.step(q_target), self.actions
         state.fill_actions(actions.action, actions.last_action)
         self._began[...] = False
@@ -203,8 +183,8 @@ class Simulation:
         if self.task.on_collision == "terminate":
             terminated = terminated | collided
         elif self.task.on_collision == "reset" and (count := xp.count_nonzero(collided)):
-            self.backend.reset(self._start, None if count == self.num_envs else collided)
-            q = self._start if noise is None else self._measured_start(noise, collided)
+            self.backend.reset(start, None if count == self.num_envs else collided)
+            q = start if noise is None else self._measured_start(noise, collided)
             actions.begin(q, collided)
         distance = terms["distance"] if "distance" in terms else zeros_like(reward) + np.nan
         self.statistics.add(distance, reward, collided)
@@ -244,14 +224,7 @@ class Simulation:
         Raises:
             GymMaraError: a value has another shape or is not finite, or the quaternion is zero. The goal stays then.
         """
-        point = finite_numbers("position", position, 3)
-        turn = np.array(finite_numbers("quaternion", quaternion, 4))
-        if not np.linalg.norm(turn) > 1e-6:
-            raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
-        turn = rotations.canonical(rotations.normalised(turn))
-        asarray, shape = self.backend.asarray, (self.num_envs, 1)
-        everyone = np.ones(self.num_envs, np.bool_)
-        self._set_goals(asarray(np.tile(point, shape)), asarray(np.tile(turn, shape)), everyone)
+        self.episodes.set_goal(position, quaternion)
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.
@@ -338,12 +311,8 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
-            "goal": self._host_goal(),
-            "start": host(self._start).copy(),
+            **self.episodes.save(),
         }
-
-    def _host_goal(self) -> tuple[Floats, Floats]:
-        return host(self.goal.position), host(self.goal.quaternion)
 
     def check_snapshot(self, snapshot: Any, others: dict[str, Any]) -> None:
         """Check that a snapshot fits this simulation, except for what the backend checks itself.
@@ -371,8 +340,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": tuple,
             "started": bool,
-            "goal": self._host_goal(),
-            "start": host(self._start),
+            **self.episodes.save(),
         }
         check_fits("snapshot", snapshot, form | others)
         steps = host(self.statistics.steps)
@@ -396,9 +364,7 @@ class Simulation:
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         self.outcome = None
-        position, quaternion = (self.backend.asarray(values.copy()) for values in snapshot["goal"])
-        self._set_goals(position, quaternion, np.ones(self.num_envs, np.bool_))
-        self._start = self.backend.asarray(snapshot["start"].copy())
+        self.episodes.restore(snapshot)
 
     def close(self) -> None:
         """Free the backend. A second call has no effect."""

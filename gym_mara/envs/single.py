@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.envs.given import GIVEN
 from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
@@ -83,18 +84,28 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode at the start configuration.
+        """Begin an episode.
+
+        Args:
+            seed: of all random numbers from now on; None to go on with those that follow.
+            options: values for this episode alone, each of which can be left out: `start_q` (J,), rad (m for a prismatic
+                joint), and where targets are drawn, `target_position` (3,), m, and `target_quaternion` (4,), [w, x, y, z],
+                both in the world. What is left out is drawn as usual, and fits to what is given; only the way from the start
+                to a given target is not checked. Later episodes are the same as without these options.
 
         Raises:
-            GymMaraError: `options` has a key; this environment has no options.
+            GymMaraError: an option is unknown or has a wrong value, or the environment does not take it; the start is beyond
+                the limits or collides; the target is out of reach, or the arm collides in all configurations found there.
+                Nothing has changed then.
         """
-        check_reset_options(options, ())
+        check_reset_options(options, GIVEN)
+        given = self.simulation.episodes.given(options)
         self._time_limits.note_reset(self)
         super().reset(seed=seed)
         if self._spawned_from is not self.np_random:
             self._spawned_from = self.np_random
             self.simulation.streams = (Streams.of(self.np_random),)
-        observation, report = self.simulation.reset()
+        observation, report = self.simulation.reset(given=given)
         if self.render_mode == "human":
             self._show()
         return self.simulation.present(observation[0]), _info_of_one(report)

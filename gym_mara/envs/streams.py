@@ -9,8 +9,10 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
+from gym_mara.envs.given import Given
+from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.snapshots import check_fits
-from gym_mara.tasks import Task, Workspace
+from gym_mara.tasks import Task
 from gym_mara.types import Floats, Mask
 
 
@@ -49,7 +51,12 @@ def parameter_seeds(streams: Sequence[Streams], chosen: Mask) -> NDArray[np.uint
 
 
 def drawn_episodes(
-    task: Task, workspace: Workspace, streams: Sequence[Streams], chosen: Mask, start: Floats
+    task: Task,
+    workspace: RobotWorkspace,
+    streams: Sequence[Streams],
+    chosen: Mask,
+    start: Floats,
+    given: Given | None = None,
 ) -> tuple[Floats, Floats, Floats]:
     """What is drawn for new episodes of the chosen arms (N,).
 
@@ -58,7 +65,8 @@ def drawn_episodes(
         workspace: of the arms.
         streams: the random generators of each arm.
         chosen: NumPy's mask (N,).
-        start: the start configurations so far (N, J), rad; they stay for the other arms, and where the task draws none.
+        start: start configurations (N, J), rad; they stay for the other arms, and where the task draws none.
+        given: what is not drawn.
 
     Returns:
         Start configurations (N, J), rad, and goals: positions (N, 3), m, and quaternions (N, 4), zero for the other arms.
@@ -66,7 +74,12 @@ def drawn_episodes(
     start = start.copy()
     position, quaternion = np.zeros((len(chosen), 3)), np.zeros((len(chosen), 4))
     for arm in np.flatnonzero(chosen).tolist():
-        own, position[arm], quaternion[arm] = task.draw(workspace, streams[arm].goals)
+        generator = streams[arm].goals
+        own, position[arm], quaternion[arm] = (
+            task.draw(workspace, generator)
+            if given is None
+            else given.draw(arm, task, workspace, generator)
+        )
         if own is not None:
             start[arm] = own
     return start, position, quaternion

@@ -26,7 +26,7 @@ _PRECISE = {"ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12, "max_nfev": 300}
 
 def solve_ik(
     robot: RobotModel,
-    position: Floats,
+    position: Floats | None,
     quaternion: Floats | None,
     start: Floats | None = None,
 ) -> Floats:
@@ -36,7 +36,7 @@ def solve_ik(
 
     Args:
         robot: the arm.
-        position: of the end-effector frame in the world (3,), m.
+        position: of the end-effector frame in the world (3,), m; None if any position will do.
         quaternion: its orientation [w, x, y, z]; None if any orientation will do.
         start: the configuration (J,) to search from first, rad, within the limits; None for home. A solution that the search
             finds from there is often, but not always, the nearest one.
@@ -62,15 +62,18 @@ def solve_ik(
     return error.configuration(best)
 
 
-def miss(robot: RobotModel, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
-    """How close the arm can come to a pose: the distance, m, and the angle, rad (0 if any orientation will do)."""
+def miss(
+    robot: RobotModel, position: Floats | None, quaternion: Floats | None
+) -> tuple[float, float]:
+    """How close the arm can come to a pose: the distance, m, and the angle, rad; 0 for one that does not matter."""
     q = solve_ik(robot, position, quaternion)
     error = _PoseError(robot, position, quaternion).of(q)
-    return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+    split = 0 if position is None else 3
+    return float(np.linalg.norm(error[:split])), float(np.linalg.norm(error[split:]))
 
 
 def _starts(
-    robot: RobotModel, position: Floats, quaternion: Floats | None, first: Floats
+    robot: RobotModel, position: Floats | None, quaternion: Floats | None, first: Floats
 ) -> Floats:
     """Where to start from (S, J): the first, then fixed random configurations, the nearest to the pose first."""
     kinematics = robot.kinematics()
@@ -82,7 +85,9 @@ def _starts(
     low, high = np.where(slides, robot.lower, low), np.where(slides, robot.upper, high)
     random = np.random.default_rng(0).uniform(low, high, (_STARTS, robot.num_joints))
     positions, quaternions = kinematics.pose(random)
-    distance = np.linalg.norm(positions - position, axis=1)
+    distance = np.zeros(_STARTS)
+    if position is not None:
+        distance = np.linalg.norm(positions - position, axis=1)
     if quaternion is not None:
         distance = np.hypot(distance, rotations.angle_between(quaternions, quaternion))
     return np.vstack([first, random[np.argsort(distance)]])
@@ -93,15 +98,19 @@ class _PoseError:
 
     Args:
         robot: the arm.
-        position: of the pose (3,), m.
+        position: of the pose (3,), m; None if any position will do.
         quaternion: of the pose, [w, x, y, z]; None if any orientation will do.
     """
 
-    def __init__(self, robot: RobotModel, position: Floats, quaternion: Floats | None) -> None:
+    def __init__(
+        self, robot: RobotModel, position: Floats | None, quaternion: Floats | None
+    ) -> None:
         w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
-        self._position = np.asarray(position)
+        self._position = np.zeros(3) if position is None else np.asarray(position)
         self._rotation = pin.Quaternion(w, x, y, z).normalized().matrix()
-        self._rows = 3 if quaternion is None else 6
+        # Of the position error and the rotation error, those that matter.
+        self._rows = slice(3 if position is None else 0, 3 if quaternion is None else 6)
+        self._count = self._rows.stop - self._rows.start
         self._model, self._data = robot.model, robot.model.createData()
         self._frame = robot.ee_frame_id
         self._q = robot.home.copy()
@@ -109,7 +118,7 @@ class _PoseError:
         """Which joints can move (J,); the others stay at their limit."""
         # SciPy's method "trf" tries full Gauss-Newton steps only if there are at least as many residuals as unknowns.
         # Without this padding an arm of seven joints takes about four times as many iterations.
-        self._padding = max(0, int(self.free.sum()) - self._rows)
+        self._padding = max(0, int(self.free.sum()) - self._count)
 
     def configuration(self, free_q: Floats) -> Floats:
         """The configuration (J,), rad, with these positions of the joints that can move."""
@@ -118,15 +127,15 @@ class _PoseError:
         return q
 
     def of(self, q: Floats) -> Floats:
-        """Position error (3,), m, and rotation error (3,), rad, where orientation counts, at q (J,)."""
+        """Position error (3,), m, and rotation error (3,), rad, or the one that matters, at q (J,)."""
         pin.forwardKinematics(self._model, self._data, q)
         here = pin.updateFramePlacement(self._model, self._data, self._frame)
         turn = pin.log3(self._rotation @ here.rotation.T)
-        return np.concatenate([self._position - here.translation, turn])[: self._rows]
+        return np.concatenate([self._position - here.translation, turn])[self._rows]
 
     def __call__(self, free_q: Floats) -> Floats:
-        residuals = np.zeros(self._rows + self._padding)
-        residuals[: self._rows] = self.of(self.configuration(free_q))
+        residuals = np.zeros(self._count + self._padding)
+        residuals[: self._count] = self.of(self.configuration(free_q))
         return residuals
 
     def jacobian(self, free_q: Floats) -> Floats:
@@ -135,6 +144,6 @@ class _PoseError:
         jacobian = -pin.computeFrameJacobian(self._model, self._data, q, self._frame, frame)
         here = pin.updateFramePlacement(self._model, self._data, self._frame)
         jacobian[3:] = pin.Jlog3(self._rotation @ here.rotation.T) @ jacobian[3:]
-        padded = np.zeros((self._rows + self._padding, len(free_q)))
-        padded[: self._rows] = jacobian[: self._rows, self.free]
+        padded = np.zeros((self._count + self._padding, len(free_q)))
+        padded[: self._count] = jacobian[self._rows, self.free]
         return padded

@@ -56,8 +56,11 @@ class Workspace(Protocol):
     def default_pose(self) -> tuple[Floats, Floats]:
         """The pose of a collision-free configuration, always the same for a robot."""
 
-    def shortfall(self, position: Floats, quaternion: Floats | None) -> tuple[float, float]:
-        """How close the arm can come to a pose: the remaining distance, m, and the remaining angle, rad."""
+    def shortfall(self, position: Floats | None, quaternion: Floats | None) -> tuple[float, float]:
+        """How close the arm can come to a pose: the remaining distance, m, and the remaining angle, rad.
+
+        None stands for any position, or any orientation.
+        """
 
 
 @dataclass(frozen=True)

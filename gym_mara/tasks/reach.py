@@ -22,8 +22,8 @@ from gym_mara.types import Floats, Mask
 if TYPE_CHECKING:
     from gym_mara.robot import RobotModel
 
-# The arm must be able to reach a target within this distance (m) and angle (rad), otherwise there is a warning.
 _REACH_TOLERANCE = (1e-3, 1e-2)
+"""A target is out of reach if the arm comes no closer than this distance, m, and this angle, rad."""
 # The smallest and the largest positive value of each constant of the reward, its unit, and whether it can be zero.
 _RANGES = {
     "alpha": (1e-3, 1e3, "", False),
@@ -68,12 +68,8 @@ class ReachTask(Task):
             object.__setattr__(self, name, flag(name, getattr(self, name)))
         self._make_plain("target_position", 3)
         self._make_plain("target_quaternion", 4)
-        quaternion = self.target_quaternion
-        if quaternion is not None and abs(np.linalg.norm(quaternion) - 1.0) > 1e-3:
-            raise GymMaraError(
-                f"target_quaternion {quaternion} has length {np.linalg.norm(quaternion):.4f}; "
-                "give a unit quaternion [w, x, y, z]"
-            )
+        if self.target_quaternion is not None:
+            check_unit("target_quaternion", self.target_quaternion)
         self._check_ranges(_RANGES, "the reward is not accurate with others")
 
     def goal(self, robot: RobotModel, workspace: Workspace, num_envs: int) -> Goal:
@@ -89,9 +85,9 @@ class ReachTask(Task):
         )
         quaternion = rotations.canonical(rotations.normalised(quaternion))
         if given != (None, None):
-            _warn_if_out_of_reach(
-                robot, workspace, position, quaternion if self.orientation else None
-            )
+            far = out_of_reach(robot, workspace, position, quaternion if self.orientation else None)
+            if far:
+                warnings.warn(far, stacklevel=2)
         return Goal(np.tile(position, (num_envs, 1)), np.tile(quaternion, (num_envs, 1)))
 
     def farthest(self, robot: RobotModel, goal: Goal) -> float:
@@ -145,14 +141,37 @@ class ReachTask(Task):
         }
 
 
-def _warn_if_out_of_reach(
-    robot: RobotModel, workspace: Workspace, position: Floats, quaternion: Floats | None
-) -> None:
-    distance, angle = workspace.shortfall(position, quaternion)
-    if distance > _REACH_TOLERANCE[0] or angle > _REACH_TOLERANCE[1]:
-        turn = f" and {np.degrees(angle):.1f}°" if quaternion is not None else ""
-        warnings.warn(
-            f"the target {position.tolist()} is out of reach of {robot.name}'s {robot.ee_frame!r}: "
-            f"the closest pose is {1000 * distance:.1f} mm{turn} away",
-            stacklevel=3,
+def check_unit(name: str, quaternion: Sequence[float]) -> None:
+    """Check that a quaternion (4,) has length 1, but for rounding.
+
+    Raises:
+        GymMaraError: it has not.
+    """
+    length = np.linalg.norm(quaternion)
+    if abs(length - 1.0) > 1e-3:
+        raise GymMaraError(
+            f"{name} {tuple(quaternion)} has length {length:.4f}; give a unit quaternion [w, x, y, z]"
         )
+
+
+def out_of_reach(
+    robot: RobotModel, workspace: Workspace, position: Floats | None, quaternion: Floats | None
+) -> str:
+    """Why a target is out of reach, and how close the arm can come; empty for one within reach.
+
+    Args:
+        robot: the arm.
+        workspace: of the arm.
+        position: of the target (3,), m; None if any position will do.
+        quaternion: of the target, [w, x, y, z]; None if any orientation will do.
+    """
+    distance, angle = workspace.shortfall(position, quaternion)
+    if distance <= _REACH_TOLERANCE[0] and angle <= _REACH_TOLERANCE[1]:
+        return ""
+    target = [values.tolist() for values in (position, quaternion) if values is not None]
+    away = [f"{1000 * distance:.1f} mm"] if position is not None else []
+    away += [f"{np.degrees(angle):.1f}°"] if quaternion is not None else []
+    return (
+        f"the target {' with '.join(map(str, target))} is out of reach of {robot.name}'s {robot.ee_frame!r}: "
+        f"the closest pose is {' and '.join(away)} away"
+    )

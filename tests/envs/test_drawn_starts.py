@@ -79,7 +79,7 @@ def test_a_snapshot_keeps_the_start(start: str) -> None:
     snapshot = env.save_state()
     env.reset(seed=2)
     env.restore_state(snapshot)
-    np.testing.assert_array_equal(env.simulation._start[0], first)
+    np.testing.assert_array_equal(env.simulation.episodes.start[0], first)
     results: list[Any] = []
     for each in (env, pickled(env)):
         each.action_space.seed(0)

@@ -388,6 +388,21 @@ def test_set_goal_moves_the_goal_to_the_device(pair: Make) -> None:
     _assert_same(tensors, arrays, "float64")
 
 
+def test_given_starts_and_targets_move_to_the_device(pair: Make) -> None:
+    seen = []
+    for env in pair("MARAReach-v0"):
+        env.reset(seed=0)
+        mask = env.simulation.backend.asarray(np.arange(ARMS) % 2 == 0)
+        q = np.full((ARMS, 6), 0.2)
+        position = env.simulation.robot.kinematics().pose(q + 0.1)[0]
+        options = {"start_q": torch.tensor(q), "target_position": position, "reset_mask": mask}
+        seen.append(env.reset(options=options)[0])
+        np.testing.assert_allclose(host(env.simulation.goal.position)[0], position[0], atol=1e-12)
+    tensors, arrays = seen
+    _tensors(tensors)
+    _assert_same(tensors, arrays, "float64", tolerance=SOLVED)
+
+
 class _HostReads(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counts how often a number is read from a tensor, for which a program waits until a GPU has done all its work."""
 

@@ -70,6 +70,17 @@ def test_an_arm_of_five_joints_never_seems_out_of_reach() -> None:
     _assert_all_reached(robot, q, 1e-3, 1e-2)
 
 
+@pytest.mark.parametrize("name", ["mara", "panda"])
+def test_an_orientation_is_reached_at_any_position(name: str) -> None:
+    robot = robot_model(name)
+    for quaternion in robot.kinematics().pose(uniform_q(robot, 50, 1))[1]:
+        (turned,) = robot.kinematics().pose(solve_ik(robot, None, quaternion)[None])[1]
+        assert angle_between(turned, quaternion) < 1e-6
+    distance, angle = miss(robot, None, quaternion)
+    assert distance == 0.0
+    assert angle < 1e-6
+
+
 def test_joints_without_limits_are_solved_for() -> None:
     robot = robot_model("panda")
     endless = np.full(robot.num_joints, np.inf)
