@@ -134,7 +134,7 @@ def test_a_table_of_metrics_has_at_most_80_columns(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["evaluate"], "give a run folder, or --baseline ik"),
+        (["evaluate"], "give a run folder, --policy pretrained and --env, or --baseline ik"),
         ([*BASELINE, "run"], "--baseline plays no run: leave out run"),
         ([*BASELINE, "--policy", "best"], "--baseline plays no run: leave out --policy"),
         (["evaluate", "run", "--env", "MARA-v0"], "has its own environment: leave out --env"),

@@ -21,7 +21,8 @@ import typer
 from gym_mara import regression
 from gym_mara.agents.algorithms.registry import ALGORITHMS, preset_names
 from gym_mara.agents.experiments.grid import Grid, run_grid
-from gym_mara.agents.runs.folder import RunConfig
+from gym_mara.agents.export.run import export
+from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.cli.app import app
 from gym_mara.tasks import TASKS
@@ -122,7 +123,7 @@ VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
-    "policy": ["last", "best"],
+    "policy": ["last", "best", "pretrained", "policy.onnx"],
     "start": ["run"],
     "from_policy": ["last", "best"],
     "preset": preset_names(),
@@ -201,13 +202,14 @@ def _value(parameter: Any, choose: random.Random, hostile: float) -> str:
 
 @pytest.fixture(scope="session")
 def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run, a finished grid of one run, and a record of rewards."""
+    """A finished run, its exported policy, a finished grid of one run, and a record of rewards."""
     folder = Path(tmp_path_factory.mktemp("fuzz"))
     train(
         RunConfig("MARA-v0", "ppo", "pinocchio", 512, 0),
         folder / "run",
         lambda steps, shown: None,
     )
+    export(RunFolder.open(folder / "run"), folder / "policy.onnx")
     grid = Grid(("MARA-v0",), ("ppo",), 1, 512)
 
     def run_here(jobs: Any, on_message: Any) -> dict[str, str]:
@@ -221,14 +223,14 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def prepare(folder: Path, originals: Path, call: list[str], choose: random.Random) -> None:
-    """Make the files that a call may find: a run, a grid and a record, perhaps damaged, and unusual files."""
+    """Make the files that a call may find: a run, a policy, a grid and a record, perhaps damaged, and unusual files."""
     folder.mkdir()
     (folder / "folder").mkdir()
     (folder / "folder" / "bystander").write_text("mine")
     (folder / "existing").write_text("mine")
     os.mkfifo(folder / "fifo")
     (folder / "loop").symlink_to("loop")
-    for name in ("run", "grid", "record.csv"):
+    for name in ("run", "policy.onnx", "grid", "record.csv"):
         if name in call:
             source = originals / name
             (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / name)

@@ -1,4 +1,4 @@
-"""The wheel: that it has every folder of the package."""
+"""The wheel: that it has every folder of the package, and the pretrained policies."""
 
 from __future__ import annotations
 
@@ -13,3 +13,11 @@ def test_the_wheel_has_every_folder_with_modules() -> None:
     listed = re.findall(r'"([\w.]+)"', text.split("packages = [")[1].split("]")[0])
     folders = {file.parent.relative_to(ROOT) for file in (ROOT / "gym_mara").rglob("*.py")}
     assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + ["gym_mara.robots"])
+
+
+def test_the_wheel_has_every_pretrained_policy() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert '"gym_mara.pretrained" = ["*.onnx"]' in text.split("[tool.setuptools.package-data]")[1]
+    folder = ROOT / "gym_mara" / "pretrained"
+    others = [f.name for f in folder.iterdir() if f.suffix != ".onnx" and f.is_file()]
+    assert others == ["__init__.py"]

@@ -14,11 +14,11 @@ from rich.table import Column, Table
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
-    PolicyOption,
     RunBackendOption,
     SetOption,
     backend_name,
     interruptible,
+    is_given,
     keyword_arguments,
     names_in,
     needs_agents,
@@ -28,6 +28,8 @@ from gym_mara.cli.common import (
     several,
     whole,
 )
+from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
+from gym_mara.deploy import OnnxPolicy
 from gym_mara.errors import GymMaraError
 from gym_mara.types import Floats
 
@@ -59,7 +61,8 @@ def _baselines() -> Iterable[str]:
 def evaluate(
     context: typer.Context,
     run: Annotated[
-        Path | None, typer.Argument(help="A run folder; leave it out with --baseline.")
+        Path | None,
+        typer.Argument(help="A run folder; leave it out with --baseline or an exported policy."),
     ] = None,
     baseline: Annotated[
         str | None,
@@ -73,16 +76,17 @@ def evaluate(
     backend: RunBackendOption = None,
     episodes: EpisodesOption = 10,
     seed: SeedOption = 0,
-    policy: PolicyOption = "last",
+    policy: AnyPolicyOption = "last",
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
     as_json: JsonOption = False,
 ) -> None:
-    """Measure a run's deterministic policy, or a baseline: accuracy, success, collisions, settling, tremble, reward.
+    """Measure a deterministic policy, or a baseline: accuracy, success, collisions, settling, tremble, reward.
 
-    Needs the extra train.
+    Needs the extra train, and for an exported policy the extra deploy.
     """
     with needs_agents():
         from gym_mara.agents.evaluation.baselines import evaluate_baseline
+        from gym_mara.agents.evaluation.exported import evaluate_exported
         from gym_mara.agents.evaluation.metrics import spread
         from gym_mara.agents.runs.evaluation import evaluate_run
         from gym_mara.agents.runs.folder import RunFolder
@@ -94,6 +98,12 @@ def evaluate(
         metrics = evaluate_baseline(
             baseline, env, backend=backend, episodes=episodes, seed=seed, options=options
         )
+    elif (file := exported_file(run, policy, env)) is not None:
+        exported = OnnxPolicy(file)
+        env, who = env if is_given(context, "env") else exported.about.env, f"policy {policy}"
+        keywords = exported.keywords(env, backend, **options)
+        backend = keywords["backend"]
+        metrics = evaluate_exported(exported, env, keywords, episodes=episodes, seed=seed)
     elif run is not None:
         refuse(context, "the run has its own environment", "env")
         folder = RunFolder.open(run)
@@ -103,7 +113,9 @@ def evaluate(
             folder, backend=backend, episodes=episodes, seed=seed, which=policy, options=options
         )
     else:
-        raise GymMaraError("give a run folder, or --baseline ik and --env")
+        raise GymMaraError(
+            "give a run folder, --policy pretrained and --env, or --baseline ik and --env"
+        )
     if as_json:
         print(json.dumps(spread(metrics), indent=2))
     else:

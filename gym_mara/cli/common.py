@@ -127,14 +127,6 @@ AlgoOption = Annotated[
         help="Algorithm: " + ", ".join(ALGORITHMS) + ".",
     ),
 ]
-PolicyOption = Annotated[
-    str,
-    typer.Option(
-        parser=one_of("policy", lambda: ("last", "best")),
-        metavar="NAME",
-        help="last, or best: the policy with the highest reward in the evaluations of the training.",
-    ),
-]
 PresetOption = Annotated[
     str,
     typer.Option(

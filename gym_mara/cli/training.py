@@ -19,7 +19,6 @@ from gym_mara.cli.common import (
     BackendOption,
     CheckpointOption,
     EnvOption,
-    PolicyOption,
     PresetOption,
     SetOption,
     StepsOption,
@@ -31,6 +30,7 @@ from gym_mara.cli.common import (
     refuse,
     whole,
 )
+from gym_mara.cli.policies import PolicyOption
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import file_name
 

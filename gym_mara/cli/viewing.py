@@ -10,10 +10,10 @@ import typer
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
-    PolicyOption,
     SetOption,
     backend_name,
     interruptible,
+    is_given,
     keyword_arguments,
     names_in,
     needs_agents,
@@ -22,6 +22,7 @@ from gym_mara.cli.common import (
     refuse,
     several,
 )
+from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
 from gym_mara.errors import GymMaraError
 
 VIEWER_SPEEDS, VIDEO_SPEEDS = (0.1, 5.0), (0.01, 100.0)
@@ -31,7 +32,8 @@ VIEWER_SPEEDS, VIDEO_SPEEDS = (0.1, 5.0), (0.01, 100.0)
 def watch(
     context: typer.Context,
     run: Annotated[
-        Path | None, typer.Argument(help="A run folder; without one, jog the joints.")
+        Path | None,
+        typer.Argument(help="A run folder; without one and without --policy, jog the joints."),
     ] = None,
     env: EnvOption = "MARA-v0",
     backend: Annotated[
@@ -39,10 +41,10 @@ def watch(
         typer.Option(
             parser=several(backend_name),
             metavar="NAMES",
-            help="Backend; by default that of the run. A video may show several, separated by commas.",
+            help="Backend; by default that of the training. A video may show several, separated by commas.",
         ),
     ] = None,
-    policy: PolicyOption = "last",
+    policy: AnyPolicyOption = "last",
     video: Annotated[
         Path | None,
         typer.Option(help="Write a new file, .mp4 or .gif, instead of opening the viewer."),
@@ -65,11 +67,14 @@ def watch(
     ] = 6.0,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Watch a run's policy in the browser, or film it; without a run, jog the joints.
+    """Watch a policy in the browser, or film that of a run; without a policy, jog the joints.
 
-    Needs the extra render, and with a run the extra train.
+    Needs the extra render, with a run also the extra train, and with an exported policy the extra deploy.
     """
-    if run is None:
+    file = exported_file(run, policy, env)
+    if file is not None:
+        refuse(context, "only the policy of a run is filmed", "video")
+    elif run is None:
         refuse(context, "without a run folder there is no policy to play", "policy", "video")
     else:
         refuse(context, "a run has its own environment", "env")
@@ -87,6 +92,13 @@ def watch(
         raise GymMaraError(
             "the viewer shows one backend at a time, and can switch: give one --backend"
         )
+    if file is not None:
+        from gym_mara.viewer.exported import watch_exported
+
+        name, one = env if is_given(context, "env") else None, chosen[0] if chosen else None
+        with interruptible("Closed."):
+            watch_exported(file, name, one, options, speed, _print)
+        return
     if run is None:
         from gym_mara.viewer import watch as open_viewer
 

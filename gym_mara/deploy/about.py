@@ -11,6 +11,7 @@ import json
 import sys
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -77,6 +78,18 @@ class Action:
     steps: tuple[float, ...]
     """What the action 1 means (A,): a joint's step, rad (m), or a component of the twist, m/s and rad/s; empty if absolute."""
     reference: str
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """The keyword arguments of an environment with these actions."""
+        return action_keywords(self.mode, self.steps, self.reference)
+
+
+def action_keywords(mode: str, steps: Iterable[float], reference: str) -> dict[str, Any]:
+    """The keyword arguments of an environment whose actions have this mode, these steps and this reference."""
+    if mode == "absolute":
+        return {"action": mode}
+    return {"action": mode, "action_scale": list(steps), "action_from": reference}
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,19 @@
-"""What an environment observes and what its actions mean, in the form of an exported policy's metadata."""
+"""What an environment observes and what its actions mean, in the form of an exported policy's metadata; and the way back."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gym_mara.deploy.about import OBSERVATION, About, Action, Joint, Part, Robot
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, unknown
+
+_OF_MACHINE = {"collision_threads", "device", "package_dirs", "threads", "workers"}
+"""Keyword arguments of a training that have a meaning on its machine alone."""
+_OF_ACTIONS = {"action", "action_from", "action_scale"}
+"""Those that `Action.keywords` replaces."""
 
 
 class Interface(NamedTuple):
@@ -119,3 +125,48 @@ def _meaning(action: Action) -> str:
     )
     start = f" from the {action.reference}" if action.mode == "relative" else ""
     return f"{action.mode} actions{start}, {numbers}"
+
+
+def backend_of(about: About) -> str:
+    """The backend of a policy's training, or the default one, with a warning, where that does not work on this machine."""
+    from gym_mara.backends import DEFAULT_BACKEND
+    from gym_mara.backends.registry import backend_class
+
+    name = about.training.backend
+    try:
+        backend_class(name).require_machine()
+    except GymMaraError as error:
+        warnings.warn(
+            f"the policy was trained on {name!r} and plays on {DEFAULT_BACKEND!r} here: {error}",
+            stacklevel=2,
+        )
+        return DEFAULT_BACKEND
+    return name
+
+
+def keywords(about: About, env: str, backend: str, given: dict[str, Any]) -> dict[str, Any]:
+    """The keyword arguments of an environment in which a policy with this metadata acts; see `OnnxPolicy.keywords`.
+
+    Raises:
+        GymMaraError: a name is unknown, or the environment of the training has no such keyword argument.
+    """
+    from gym_mara.backends import backend_settings
+    from gym_mara.envs import task_keywords
+    from gym_mara.envs.sensors import SensorSettings
+    from gym_mara.robot.options import ROBOT_KEYWORDS
+
+    training, settings = about.training, backend_settings(backend)
+    # A stranger's file must not set options of the viewer, so these are all that it can set.
+    known = {*ROBOT_KEYWORDS, *task_keywords(env), *settings, *SensorSettings.__dataclass_fields__}
+    own = dict(training.env_options)
+    for name in own.keys() & (_OF_MACHINE | _OF_ACTIONS):
+        del own[name]
+    for name in own.keys() - known:
+        if (env, backend) == (about.env, training.backend):
+            raise unknown("keyword argument", name, known, " in the metadata of the policy")
+        del own[name]
+    if given.get("action", about.action.mode) == about.action.mode:  # else `check_fits` refuses it
+        own |= about.action.keywords
+    if "control_period" in settings:
+        own["control_period"] = about.control_period
+    return {"backend": backend, **own, **given}

@@ -173,6 +173,27 @@ class OnnxPolicy:
             )
         return checked
 
+    def keywords(
+        self, env: str | None = None, backend: str | None = None, **given: Any
+    ) -> dict[str, Any]:
+        """The keyword arguments of an environment in which the policy acts as in its training, for `gymnasium.make`.
+
+        They are those of the training, the policy's actions and its control period. The folders of a robot of your own are not
+        in the file: give `robot` and `package_dirs`.
+
+        Args:
+            env: the name of the environment; by default `about.env`. Another one, and another backend, gets those keyword
+                arguments of the training that it knows.
+            backend: by default that of the training, or "pinocchio", with a warning, where that does not work on this machine.
+            **given: what replaces the keyword arguments of the training.
+
+        Raises:
+            GymMaraError: a name is unknown, or the environment of the training has no such keyword argument.
+        """
+        from gym_mara.deploy.environment import backend_of, keywords
+
+        return keywords(self.about, env or self.about.env, backend or backend_of(self.about), given)
+
     def check(self, env: Any) -> None:
         """Check that the policy can act in an environment of gym_mara: single, vectorised or wrapped.
 

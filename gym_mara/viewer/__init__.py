@@ -22,6 +22,7 @@ def watch(
     *,
     speed: float = 1.0,
     seed: int | None = None,
+    endless: bool = False,
 ) -> None:
     """Open a viewer and step an environment until the user interrupts with Ctrl+C.
 
@@ -29,11 +30,12 @@ def watch(
         env: the name of an environment.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: maps observations of one arm, with a leading axis of length 1, to actions (1, A); it plays one episode
-            after the other. None: the user moves the joints with the sliders, from the home configuration, in one
-            episode without an end.
+        policy: maps observations of one arm, with a leading axis of length 1, to actions (1, A). None: the user moves the
+            joints with the sliders, from the home configuration, in one episode without an end.
         speed: the speed of the simulation relative to real time.
         seed: the seed of the environment.
+        endless: whether the policy's episode goes on until something terminates it; else one episode of the environment's length
+            follows the other.
 
     Raises:
         GymMaraError: a name is unknown, a value is out of its range, or the viewer cannot listen on its address.
@@ -49,7 +51,7 @@ def watch(
         viewer = Viewer(simulation, simulation.options.rendering)
         viewer.set_speed(speed)
         if policy is not None:
-            viewer.run(policy, environment(env).max_episode_steps)
+            viewer.run(policy, None if endless else environment(env).max_episode_steps)
         else:
             viewer.jog()
             viewer.run(lambda _: None, None)

@@ -81,7 +81,7 @@ class BrowserScene:
         self.show(view)
 
     def show(self, view: View) -> None:
-        """Move the links to their poses in a view, and colour them. The target stays: the user moves it."""
+        """Move the links to their poses in a view, and colour them. The target stays: the user may be dragging it."""
         placements = self._scene.placements(view)
         with self._server.atomic():
             for link, first_part in self._first_parts.items():
@@ -92,6 +92,11 @@ class BrowserScene:
                 if colour != self._colours[index]:
                     self._meshes[index].color = _bytes(colour)
                     self._colours[index] = colour
+
+    def move_target(self, view: View) -> None:
+        """Move the target to its pose in a view."""
+        with self._server.atomic():
+            self.target.position, self.target.wxyz = view.target_position, view.target_quaternion
 
 
 def _bytes(colour: Colour) -> tuple[int, int, int]:

@@ -70,6 +70,7 @@ class Viewer:
         self.camera = place_camera(scene, view, settings)
         """The initial camera of a browser."""
         self._scene = BrowserScene(self._server, scene, self.camera, view)
+        self._shown_goal = simulation.goal
         self._panel = Panel(self._server, simulation, view.q)
         for control, check in self._panel.checks():
             gate.let_in(control, check)
@@ -118,10 +119,14 @@ class Viewer:
         return outcome
 
     def show(self) -> None:
-        """Draw the arm in its current state."""
+        """Draw the arm in its current state, and the target if the program has moved it, as a new episode does."""
         self._drawn = time.monotonic()
+        view, goal = view_of(self._simulation, 0), self._simulation.goal
         with _sender_errors_ignored():
-            self._scene.show(view_of(self._simulation, 0))
+            self._scene.show(view)
+            if goal is not self._shown_goal:
+                self._shown_goal = goal
+                self._scene.move_target(view)
 
     def jog(self) -> None:
         """Take the joint targets from the sliders, as if the user had moved one."""
@@ -212,6 +217,7 @@ class Viewer:
             backend, self._backend = self._backend, None
         if goal is not None:
             self._simulation.set_goal(*goal)
+            self._shown_goal = self._simulation.goal  # the browser shows it already
         if backend not in (None, self._simulation.backend_name):
             try:
                 self._simulation.switch_backend(str(backend))

@@ -1,4 +1,4 @@
-"""Small exported policies: their action is the sum of the observation, for each joint."""
+"""Small exported policies: an action is a sum of the observation, or a step of inverse kinematics."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from onnx import helper, numpy_helper
 
 from gym_mara.deploy.about import METADATA_KEY, About, Action, Joint, Part, Robot, Training
+from gym_mara.deploy.environment import interface
+from gym_mara.envs import MaraEnv
 
 JOINTS = (
     Joint("turn", "rad", -2.0, 2.5, 1.5, 0.03),
@@ -48,22 +50,51 @@ def about(action: Action = ABSOLUTE, observation: tuple[Part, ...] = ARRAY) -> A
     )
 
 
-def model(metadata: About, sizes: dict[str, int] | None = None, dtype: Any = np.float64) -> Any:
-    """The model of a policy; `sizes` are those of its inputs if they differ from those of the metadata."""
+def model(
+    metadata: About,
+    sizes: dict[str, int] | None = None,
+    dtype: Any = np.float64,
+    weights: Any = None,
+) -> Any:
+    """The model of a policy; `sizes` are those of its inputs if they differ from those of the metadata.
+
+    The weights (O, A) are ones if none are given.
+    """
     kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     inputs = metadata.inputs if sizes is None else sizes
     actions = len(metadata.action.low)
-    ones = numpy_helper.from_array(np.ones((sum(inputs.values()), actions), dtype), "ones")
+    ones = np.ones((sum(inputs.values()), actions)) if weights is None else weights
+    matrix = numpy_helper.from_array(ones.astype(dtype), "weights")
     nodes = [
         helper.make_node("Concat", [*inputs], ["all"], axis=1),
-        helper.make_node("MatMul", ["all", "ones"], ["action"]),
+        helper.make_node("MatMul", ["all", "weights"], ["action"]),
     ]
     values = [helper.make_tensor_value_info(n, kind, ["N", s]) for n, s in inputs.items()]
     action = helper.make_tensor_value_info("action", kind, ["N", actions])
-    graph = helper.make_graph(nodes, "sum", values, [action], [ones])
+    graph = helper.make_graph(nodes, "sum", values, [action], [matrix])
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     helper.set_model_props(made, {METADATA_KEY: metadata.to_json()})
     return made
+
+
+def fitting(env: Any, name: str = "MARA-v0", **env_options: Any) -> About:
+    """The metadata of a policy that was trained in an environment of this name with these keyword arguments."""
+    training = dataclasses.replace(about().training, env_options=env_options)
+    there = interface(env.simulation)._asdict()
+    return dataclasses.replace(about(), env=name, training=training, **there)
+
+
+def solving(path: Path, name: str, **env_options: Any) -> Path:
+    """Write a policy that reaches targets: its action is the step of inverse kinematics that MARAReach-v0 observes."""
+    env = MaraEnv(name, **env_options)
+    metadata = fitting(env, name, **env_options)
+    env.close()
+    sizes = [part.size for part in metadata.observation]
+    first = sum(sizes[: [part.name for part in metadata.observation].index("joint_steps")])
+    joints = len(metadata.robot.joints)
+    weights = np.zeros((sum(sizes), joints))
+    weights[first : first + joints] = np.eye(joints)
+    return write_model(path, model(metadata, weights=weights))
 
 
 def write_model(path: Path, made: Any) -> Path:

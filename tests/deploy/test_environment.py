@@ -10,18 +10,14 @@ import gymnasium
 import numpy as np
 import pytest
 
+from gym_mara.backends.dart import DartBackend
 from gym_mara.deploy import About, OnnxPolicy
-from gym_mara.deploy.about import FORMAT, Action
+from gym_mara.deploy.about import Action
 from gym_mara.deploy.environment import interface
 from gym_mara.envs import MaraEnv, MaraGoalEnv, MaraVectorEnv
 from gym_mara.errors import GymMaraError
-from tests.deploy.models import about, model, write_model
+from tests.deploy.models import about, fitting, model, solving, write_model
 from tests.helpers import joint_xml, urdf_xml, write
-
-
-def fitting(env: Any) -> About:
-    """The metadata of a policy for an environment."""
-    return dataclasses.replace(about(), format=FORMAT, **interface(env.simulation)._asdict())
 
 
 def policy(folder: Path, metadata: About) -> OnnxPolicy:
@@ -155,3 +151,98 @@ def test_other_actions_are_refused(tmp_path: Path) -> None:
 def test_an_environment_of_another_package_is_refused(tmp_path: Path, env: Any) -> None:
     with pytest.raises(GymMaraError, match="an environment of gym_mara is needed"):
         policy(tmp_path, about()).check(env)
+
+
+# And back: the environment of a policy.
+
+
+REACH: dict[str, Any] = {"start": "home", "max_joint_velocity": 1.0, "servo_gain": 5.0}
+
+
+def test_the_environment_of_the_training_is_made_again(tmp_path: Path) -> None:
+    own = OnnxPolicy(solving(tmp_path / "policy.onnx", "MARAReach-v0", action_scale=0.02, **REACH))
+    env = gymnasium.make(f"gym_mara/{own.about.env}", **own.keywords())
+    own.check(env)
+    simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+    assert simulation.task.start == "home"
+    assert simulation.backend.servo_gain == 5.0
+    np.testing.assert_array_equal(simulation.backend.joint_velocity, np.ones(6))
+    np.testing.assert_array_equal(simulation.actions.steps, np.full(6, 0.02))
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"action": "relative", "action_scale": 0.01, "action_from": "target"},
+        {"action": "cartesian"},
+        {"control_period": 0.01},
+        {"robot": ["base", "motor_large", "motor_medium", "tool"]},
+    ],
+    ids=str,
+)
+def test_it_has_the_actions_the_period_and_the_robot_of_the_policy(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    own = policy(tmp_path, fitting(MaraEnv(**options), **options))
+    own.check(MaraEnv(**own.keywords()))
+
+
+def test_what_is_given_replaces_the_keyword_arguments_of_the_training(tmp_path: Path) -> None:
+    own = OnnxPolicy(solving(tmp_path / "policy.onnx", "MARAReach-v0", **REACH))
+    there = own.keywords(start="random", position_tolerance=0.01)
+    assert (there["start"], there["position_tolerance"]) == ("random", 0.01)
+    with pytest.raises(GymMaraError, match="it acts with relative actions"):
+        own.check(MaraEnv("MARAReach-v0", **own.keywords(action="absolute")))
+
+
+def test_another_backend_gets_the_settings_that_it_knows(tmp_path: Path) -> None:
+    own = OnnxPolicy(
+        solving(tmp_path / "policy.onnx", "MARAReach-v0", path_resolution=0.01, **REACH)
+    )
+    env = MaraEnv("MARAReach-v0", **own.keywords(backend="dart"))
+    own.check(env)
+    assert env.simulation.backend.servo_gain == 5.0
+    env.close()
+
+
+def test_another_environment_gets_the_keyword_arguments_that_it_knows(tmp_path: Path) -> None:
+    own = policy(tmp_path, fitting(MaraEnv(kappa=0.5), kappa=0.5, max_joint_velocity=1.0))
+    assert own.keywords()["kappa"] == 0.5
+    there = own.keywords("MARAReach-v0")
+    assert "kappa" not in there
+    assert there["max_joint_velocity"] == 1.0
+
+
+def test_what_was_set_for_the_machine_of_the_training_is_left_out(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"collision_threads": 2, "workers": 16, "package_dirs": ["robots"]}
+    own = policy(tmp_path, fitting(MaraEnv(), **options))
+    assert own.keywords() == {"backend": "pinocchio", "action": "absolute", "control_period": 0.02}
+
+
+@pytest.mark.parametrize("name", ["viewer_host", "render_mode", "num_envs", "colour"])
+def test_a_file_cannot_set_anything_else(tmp_path: Path, name: str) -> None:
+    own = policy(tmp_path, fitting(MaraEnv(), **{name: "0.0.0.0"}))
+    with pytest.raises(GymMaraError, match=f"unknown keyword argument '{name}' in the metadata"):
+        own.keywords()
+    assert name not in own.keywords(backend="mujoco")
+
+
+@pytest.mark.parametrize("missing", ["dart", "of another package"])
+def test_where_the_backend_of_the_training_is_missing_the_policy_plays_on_the_default_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    monkeypatch.setattr(DartBackend, "require_machine", refuse)
+    metadata = fitting(MaraEnv("MARAReach-v0"), "MARAReach-v0", physics_step=0.001)
+    training = dataclasses.replace(metadata.training, backend=missing)
+    own = policy(tmp_path, dataclasses.replace(metadata, training=training))
+    with pytest.warns(match=f"was trained on '{missing}' and plays on 'pinocchio' here: "):
+        there = own.keywords()
+    assert there["backend"] == "pinocchio"
+    own.check(MaraEnv("MARAReach-v0", **there))
+    assert own.keywords(backend="mujoco")["backend"] == "mujoco"
+
+
+def refuse() -> None:
+    raise GymMaraError("there is no such machine")

@@ -192,6 +192,32 @@ def test_the_view_marks_colliding_links() -> None:
     loop.env.close()
 
 
+def test_the_target_is_shown_where_a_new_episode_has_it() -> None:
+    loop = Loop(task="MARARandomTarget-v0")
+    simulation, target = loop.env.simulation, loop.viewer._scene.target
+    shown = []
+    for _ in range(3):
+        loop.env.reset()
+        np.testing.assert_array_equal(target.position, simulation.goal.position[0])
+        np.testing.assert_array_equal(target.wxyz, simulation.goal.quaternion[0])
+        shown.append(tuple(target.position))
+    assert len({*shown}) == 3
+    loop.env.close()
+
+
+def test_the_target_stays_under_the_hand_that_drags_it() -> None:
+    loop = Loop(task="MARARandomTarget-v0")
+    simulation, target = loop.env.simulation, loop.viewer._scene.target
+    target.position = np.array([0.3, 0.2, 0.5])
+    loop.viewer._on_target(None)
+    target.position = np.array([0.3, 0.2, 0.6])  # the hand has moved on
+    loop.env.step(ACTION)
+    loop.viewer.show()
+    np.testing.assert_array_equal(simulation.goal.position[0], [0.3, 0.2, 0.5])
+    np.testing.assert_array_equal(target.position, [0.3, 0.2, 0.6])
+    loop.env.close()
+
+
 @pytest.mark.parametrize("failing", ["_panel.update", "_scene.show"])
 def test_a_race_in_visers_sender_does_not_stop_the_arm(
     monkeypatch: pytest.MonkeyPatch, failing: str

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.evaluation.episodes import arms_of_a_batch, play_episodes
 from gym_mara.agents.evaluation.rollout import Begin
-from gym_mara.agents.runs.evaluation import make_arms
+from gym_mara.agents.runs.evaluation import measure_acting
 from gym_mara.envs.actions import AbsoluteActions, RelativeActions
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, one_of
-from gym_mara.registration import environment
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.types import Floats
 
@@ -111,10 +109,4 @@ def evaluate_baseline(
         GymMaraError: the baseline cannot act in this environment, a name is unknown, or a value is out of its range.
     """
     begin = BASELINES[one_of("baseline", name, BASELINES)]
-    steps = environment(env).max_episode_steps
-    count = arms_of_a_batch(episodes, steps)
-    arms = make_arms(env, backend, count, options or {}, max_episode_steps=None)
-    try:
-        return play_episodes(arms, begin, steps=steps, episodes=episodes, seed=seed)
-    finally:
-        arms.close()
+    return measure_acting(begin, env, backend, options or {}, episodes=episodes, seed=seed)

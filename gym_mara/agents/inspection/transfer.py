@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from gym_mara.agents.runs.evaluation import (
-    VELOCITY_LIMIT,
     measure_run,
     options_beyond_backend,
     with_options,
@@ -19,6 +18,7 @@ from gym_mara.backends import backend_settings, usable_backends
 from gym_mara.envs import task_keywords
 from gym_mara.envs.actions import ActionSettings
 from gym_mara.envs.sensors import SensorSettings
+from gym_mara.envs.travel import VELOCITY_LIMIT
 from gym_mara.errors import unknown
 from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.types import Floats

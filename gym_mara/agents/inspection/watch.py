@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.agents.runs.evaluation import VELOCITY_LIMIT, Player, options_on
+from gym_mara.agents.runs.evaluation import Player, options_on
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.envs.travel import VELOCITY_LIMIT, travel_note
 from gym_mara.rendering.film import HIGHEST_RATE, Film, check_film_path, labelled
 from gym_mara.viewer import watch
 
@@ -121,8 +122,5 @@ def _settings(
     if limit is None:
         return settings
     if log is not None:
-        log(
-            f"{backend}: shown with joints of at most {limit:.3g} rad/s, the robot's limit; "
-            f"to see them teleport, --set {VELOCITY_LIMIT}=null"
-        )
+        log(travel_note(backend, limit))
     return settings | {VELOCITY_LIMIT: limit}

@@ -13,6 +13,7 @@ from pydantic import Field
 from gym_mara.agents.runs.config import DamagedRunError
 from gym_mara.agents.runs.folder import versions
 from gym_mara.backends import backend_settings
+from gym_mara.deploy.about import action_keywords
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.files import read_json
@@ -60,13 +61,7 @@ class ActionDescription:
     @property
     def keywords(self) -> dict[str, Any]:
         """The keyword arguments of an environment with these actions."""
-        if self.mode == "absolute":
-            return {"action": self.mode}
-        return {
-            "action": self.mode,
-            "action_scale": list(self.steps),
-            "action_from": self.reference,
-        }
+        return action_keywords(self.mode, self.steps, self.reference)
 
 
 ABSOLUTE = ActionDescription("absolute", [], "position")

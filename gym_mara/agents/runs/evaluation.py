@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Any
 
 from gym_mara.agents.evaluation.episodes import arms_of_a_batch, episode_seeds, play_episodes
-from gym_mara.agents.evaluation.rollout import Act
+from gym_mara.agents.evaluation.rollout import Act, Begin
 from gym_mara.agents.runs.config import check_options
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.runs.policy import load_policy
@@ -17,6 +17,7 @@ from gym_mara.backends import backend_settings
 from gym_mara.envs import MaraVectorEnv, make_vector_env
 from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.simulation import Simulation
+from gym_mara.envs.travel import travel_velocity
 from gym_mara.registration import environment
 from gym_mara.robot import RobotModel
 from gym_mara.robot.options import ROBOT_KEYWORDS
@@ -26,8 +27,6 @@ _OTHER_ROBOT = {*ROBOT_KEYWORDS} - {"package_dirs"}
 """The keyword arguments that make another robot; `package_dirs` only says where its files are."""
 RANDOM_EPISODES = 5
 """How many episodes judge a policy where they are random: as many as in Stable-Baselines3's `EvalCallback`."""
-VELOCITY_LIMIT = "max_joint_velocity"
-"""The setting with which joints travel that would else teleport."""
 
 
 def make_arms(
@@ -117,16 +116,8 @@ class Player:
 
     @property
     def velocity_limit(self) -> float | None:
-        """If the joints teleport, the value of VELOCITY_LIMIT with which they travel: the robot's lowest velocity limit, rad/s.
-
-        None if they do not teleport, or if the backend or the robot has no limit.
-        """
-        simulation = self.env.simulation
-        lowest = float(simulation.robot.velocity_limit.min())
-        limited = VELOCITY_LIMIT in backend_settings(simulation.backend_name)
-        if simulation.backend.teleports and limited and 0.0 < lowest < math.inf:
-            return lowest
-        return None
+        """If the joints teleport, the velocity limit with which they travel, rad/s; see `gym_mara.envs.travel`."""
+        return travel_velocity(self.env.simulation)
 
     def __enter__(self) -> Player:
         return self
@@ -180,6 +171,34 @@ def measure_run(
         steps, limit = player.episode_steps, player.velocity_limit
         played = play_episodes(player.env, player.begin, steps=steps, episodes=episodes, seed=seed)
     return played, limit
+
+
+def measure_acting(
+    begin: Begin, env: str, backend: str, options: dict[str, Any], *, episodes: int, seed: int
+) -> dict[str, Floats]:
+    """Play the episodes that `evaluate_run` plays, with anything that acts.
+
+    Args:
+        begin: what acts.
+        env: the name of the environment.
+        backend: the name of the backend.
+        options: keyword arguments of the environment.
+        episodes: the number of episodes.
+        seed: of the evaluation.
+
+    Returns:
+        Each of METRICS per episode (episodes,).
+
+    Raises:
+        GymMaraError: a name is unknown, a value is out of its range, or `begin` refuses the environment.
+    """
+    steps = environment(env).max_episode_steps
+    count = arms_of_a_batch(episodes, steps)
+    arms = make_arms(env, backend, count, options, max_episode_steps=None)
+    try:
+        return play_episodes(arms, begin, steps=steps, episodes=episodes, seed=seed)
+    finally:
+        arms.close()
 
 
 def options_on(

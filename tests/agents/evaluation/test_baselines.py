@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gym_mara.agents.evaluation import baselines
 from gym_mara.agents.evaluation.baselines import StraightMove, evaluate_baseline
 from gym_mara.agents.evaluation.episodes import episode_seeds
 from gym_mara.agents.evaluation.metrics import measure, settling_time
 from gym_mara.agents.evaluation.rollout import Trajectory, roll_out
 from gym_mara.agents.runs.evaluation import make_arms
 from gym_mara.errors import GymMaraError
-from gym_mara.registration import Environment, environment
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, ReachTask, registry
 from gym_mara.types import Floats
+from tests.agents.conftest import shorten_episodes
 
 TRAVELLING = {"max_joint_velocity": 1.0}
 ARMS, STEPS = 3, 200
@@ -148,10 +147,7 @@ def test_an_unknown_baseline_is_an_error() -> None:
 
 
 def test_it_plays_the_episodes_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    def short(name: str) -> Environment:
-        return environment(name)._replace(max_episode_steps=3)
-
-    monkeypatch.setattr(baselines, "environment", short)
+    shorten_episodes(monkeypatch, 3)
     played = evaluate_baseline("ik", "MARARandomTarget-v0", backend="pinocchio", episodes=4)
     np.testing.assert_allclose(played["return"], 3.0 * played["reward_per_step"])
     assert len(set(played["return"])) == 4

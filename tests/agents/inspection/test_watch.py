@@ -29,6 +29,7 @@ from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film, labelled
 from tests.agents.conftest import config
 from tests.browser import chromium
+from tests.deploy.models import solving
 from tests.helpers import robot_model, started
 
 # The libraries that read films leave pipes open.
@@ -317,13 +318,17 @@ def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_run", [True, False], ids=["run", "jog"])
+@pytest.mark.parametrize(("what", "port"), [("run", 8300), ("exported", 8301), ("jog", 8302)])
 def test_watch_serves_the_viewer_until_an_interrupt(
-    finished_run: RunFolder, with_run: bool
+    finished_run: RunFolder, tmp_path: Path, what: str, port: int
 ) -> None:
-    what = [str(finished_run.path)] if with_run else ["--env", "MARAOrient-v0"]
-    port = 8300 + with_run
-    command = ["-m", "gym_mara.cli", "watch", *what]
+    file = solving(tmp_path / "policy.onnx", "MARAReach-v0")
+    arguments = {
+        "run": [str(finished_run.path)],
+        "exported": ["--policy", str(file), "--env", "MARAReach-v0"],
+        "jog": ["--env", "MARAOrient-v0"],
+    }
+    command = ["-m", "gym_mara.cli", "watch", *arguments[what]]
     command += ["--backend", "dart", "--set", f"viewer_port={port}"]
     with started(*command) as watching:
         deadline = time.monotonic() + 60
