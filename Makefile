@@ -50,7 +50,7 @@ CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
 TESTS ?=
 # Another Gymnasium changes nothing in these.
-OTHER_TESTS = $(patsubst %,tests/test_%.py,cli_fuzz cli_process cli_robot docs errors examples files package rotations snapshots)
+OTHER_TESTS = $(patsubst %,tests/test_%.py,benchmark_reach cli_fuzz cli_process cli_robot docs errors examples files package rotations snapshots)
 GYMNASIUM_TESTS = $(filter-out $(OTHER_TESTS),$(wildcard tests/test_*.py)) tests/envs tests/rendering/test_pictures.py tests/agents/test_sb3.py
 
 $(READY): pyproject.toml $(CONSTRAINTS)

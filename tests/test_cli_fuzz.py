@@ -139,6 +139,7 @@ VALID: dict[str, Sequence[str]] = {
     "tolerance": ["0", "1e-9"],
     "speed": ["1", "0.1", "5"],
     "seconds": ["0.1"],
+    "targets": ["1", "2"],
     "run": ["run"],
     "resume": ["run"],
     "folder": ["grid"],
@@ -184,7 +185,8 @@ def arguments_of(choose: random.Random) -> list[str]:
     if "--resume" in call and choose.random() < 0.7:
         call = ["train", "--resume", call[call.index("--resume") + 1]]
     if "--video" in call:
-        call += ["--seconds", "0.1", "--set", "width=64", "--set", "height=48"]
+        call += ["--set", "width=64", "--set", "height=48"]
+        call += [] if "--targets" in call else ["--seconds", "0.1"]
     return call
 
 

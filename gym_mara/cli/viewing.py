@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,7 @@ from gym_mara.cli.common import (
     out,
     refuse,
     several,
+    whole,
 )
 from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
 from gym_mara.errors import GymMaraError
@@ -65,6 +67,14 @@ def watch(
             help="Length of the episode that a video shows, s.",
         ),
     ] = 6.0,
+    targets: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(1, 100),
+            metavar="N",
+            help="Instead of one episode, a video shows so many random targets in a row, without a reset.",
+        ),
+    ] = None,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
     """Watch a policy in the browser, or film that of a run; without a policy, jog the joints.
@@ -73,25 +83,30 @@ def watch(
     """
     file = exported_file(run, policy, env)
     if file is not None:
-        refuse(context, "only the policy of a run is filmed", "video")
+        refuse(context, "only the policy of a run is filmed", "video", "targets")
     elif run is None:
-        refuse(context, "without a run folder there is no policy to play", "policy", "video")
+        names = "policy", "video", "targets"
+        refuse(context, "without a run folder there is no policy to play", *names)
     else:
         refuse(context, "a run has its own environment", "env")
     if video is None:
-        refuse(context, "the viewer has no end; only --video has a length", "seconds")
+        refuse(context, "the viewer has no end; only --video has a length", "seconds", "targets")
         if not VIEWER_SPEEDS[0] <= speed <= VIEWER_SPEEDS[1]:
             raise GymMaraError(
                 "--speed of the viewer must be from {:g} to {:g}, not {:g}".format(
                     *VIEWER_SPEEDS, speed
                 )
             )
+    if targets is not None:
+        refuse(context, "a video of several targets ends after the last one", "seconds")
     options = keyword_arguments(settings, pictures=video is not None, viewer=video is None)
     chosen = names_in("--backend", backend or [])
     if video is None and len(chosen) > 1:
         raise GymMaraError(
             "the viewer shows one backend at a time, and can switch: give one --backend"
         )
+    if targets is not None and len(chosen) > 1:
+        raise GymMaraError("a video of several targets shows one backend: give one --backend")
     if file is not None:
         from gym_mara.viewer.exported import watch_exported
 
@@ -108,23 +123,18 @@ def watch(
             open_viewer(env, chosen[0] if chosen else DEFAULT_BACKEND, keywords, speed=speed)
         return
     with needs_agents():
-        from gym_mara.agents.inspection.watch import film_run, watch_run
+        from gym_mara.agents.inspection.watch import film_run, film_targets, watch_run
         from gym_mara.agents.runs.folder import RunFolder
 
     folder = RunFolder.open(run)
     backends = list(chosen) or [folder.config.backend]
     if video is not None:
         with interruptible("Interrupted; no video was written."):
-            film_run(
-                folder,
-                video,
-                backends,
-                options,
-                which=policy,
-                seconds=seconds,
-                speed=speed,
-                log=_print,
-            )
+            if targets is None:
+                film = partial(film_run, backends=backends, seconds=seconds)
+            else:
+                film = partial(film_targets, backend=backends[0], targets=targets)
+            film(folder, video, options=options, which=policy, speed=speed, log=_print)
         out.print(str(video), soft_wrap=True)
         return
     with interruptible("Closed."):

@@ -20,14 +20,18 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from gym_mara.agents.evaluation.baselines import StraightMove
 from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
-from gym_mara.agents.inspection.watch import film_run, watch_run
+from gym_mara.agents.inspection.watch import film_run, film_targets, watch_run
+from gym_mara.agents.runs.evaluation import Player
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.training.train import train
+from gym_mara.envs.outcome import Outcome
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film, labelled
-from tests.agents.conftest import config
+from tests.agents.conftest import ROLLOUT, config, silent
 from tests.browser import chromium
 from tests.deploy.models import solving
 from tests.helpers import robot_model, started
@@ -91,6 +95,94 @@ def test_two_backends_are_filmed_side_by_side(
     assert names[:2] == ["pinocchio, at most 1.57 rad/s", "dart"]
     assert differing(start[scene, :160], start[scene, 160:]) < 0.001
     assert differing(shown[-1, scene, :160], shown[-1, scene, 160:]) > 0.0005
+
+
+@pytest.fixture(scope="module")
+def random_target_run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run of an environment that draws its targets."""
+    run = config(env="MARARandomTarget-v0", steps=ROLLOUT)
+    return train(run, Path(tmp_path_factory.mktemp("runs")) / "run", silent)
+
+
+class Steps:
+    """Notes each step of a player, and the labels of the pictures; another thing than the policy acts."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, act: Any) -> None:
+        self.labels: list[str] = []
+        self.starts: list[Any] = []
+        self.outcomes: list[Outcome] = []
+        self.targets: list[Any] = []
+        step = Player.step
+
+        def noted_step(player: Player) -> Outcome:
+            simulation = player.env.simulation
+            self.starts.append(simulation.backend.state.q[0])
+            self.targets.append(tuple(simulation.goal.position[0]))
+            self.outcomes.append(step(player))
+            return self.outcomes[-1]
+
+        def noted_label(picture: Any, text: str) -> Any:
+            self.labels.append(text)
+            return labelled(picture, text)
+
+        monkeypatch.setattr(Player, "step", noted_step)
+        monkeypatch.setattr(Player, "act", act)
+        monkeypatch.setattr(watch_module, "labelled", noted_label)
+
+
+def test_in_a_film_of_targets_the_arm_goes_on_from_each_that_it_has_reached(
+    random_target_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moves: dict[bytes, StraightMove] = {}
+
+    def straight(player: Player, observation: Any) -> Any:
+        simulation = player.env.simulation
+        target = simulation.goal.position.tobytes()
+        if target not in moves:
+            moves[target] = StraightMove(simulation)
+        return moves[target](observation)
+
+    steps, film = Steps(monkeypatch, straight), tmp_path / "film.gif"
+    film_targets(random_target_run, film, "pinocchio", SMALL, targets=3, rate=5.0)
+    ends = [outcome.state.q[0] for outcome in steps.outcomes]
+    assert len(set(steps.targets)) == 3
+    np.testing.assert_array_equal(steps.starts[1:], ends[:-1])
+    for target in dict.fromkeys(steps.targets):
+        errors = [
+            float(outcome.info["position_error"][0])
+            for outcome, own in zip(steps.outcomes, steps.targets, strict=True)
+            if own == target
+        ]
+        assert max(errors[-25:]) <= 0.005 < errors[-26], "it ends after half a second at the target"
+    assert steps.labels[0] == "target 1 of 3"
+    assert steps.labels[-1].startswith("target 3 of 3: 0.")
+    times = [imageio.immeta(film, index=index)["duration"] for index in range(len(pictures(film)))]
+    still = 600  # three pictures
+    assert sum(times) == pytest.approx(still + 20 * len(steps.outcomes), abs=200)
+
+
+def test_a_film_of_targets_shows_a_collision_and_puts_the_arm_back(
+    random_target_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    into_the_table = np.array([[0.0, 2.5, 0.0, 0.0, 0.0, 0.0]])
+    steps = Steps(monkeypatch, lambda *_: into_the_table)
+    film_targets(random_target_run, tmp_path / "film.gif", "pinocchio", SMALL, targets=2, rate=5.0)
+    collided = [bool(outcome.state.collided[0]) for outcome in steps.outcomes]
+    assert collided.count(True) == 2
+    assert steps.labels[-1] == "target 2 of 2: collision"
+    second = collided.index(True) + 1
+    np.testing.assert_array_equal(steps.starts[second], steps.starts[0])
+
+
+def test_a_film_of_targets_needs_an_environment_that_draws_them(
+    finished_run: RunFolder, random_target_run: RunFolder, tmp_path: Path
+) -> None:
+    film = tmp_path / "film.gif"
+    with pytest.raises(GymMaraError, match=r"MARACollisionOrient-v0 has the same target in every"):
+        film_targets(finished_run, film, "pinocchio", SMALL, targets=2)
+    with pytest.raises(GymMaraError, match="leave out on_collision"):
+        film_targets(random_target_run, film, "pinocchio", {"on_collision": "continue"}, targets=2)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
