@@ -80,7 +80,8 @@ def test_with_a_guide_the_joint_with_the_longest_way_is_rewarded_for_its_speed()
     task = AnyTargetTask(guide=True, progress_weight=2.0)
     ways = np.array([0.1, -0.9, 0.3, 0.0, 0.0, 0.0])
     others = np.full(6, np.inf), np.full(6, 1.5)
-    goal = Goal(*dataclasses.astuple(ORIGIN)[:2], np.stack([others[0], ways, others[1]])[None])
+    known = np.stack([others[0], ways, others[1]])[None]
+    goal = Goal(ORIGIN.position, ORIGIN.quaternion, known)
     speed = np.array([[0.7, -0.25, 0.1, 0.0, 0.0, 0.0]])
     _, terms = task.reward(_at(qd=speed), goal)
     assert terms["reward_progress"].tolist() == [2.0 * 0.25]

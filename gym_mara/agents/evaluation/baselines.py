@@ -68,13 +68,13 @@ class StraightMove:
         target = q + way / np.maximum(_most(way, self._reach), 1.0)
         if not isinstance(actions, RelativeActions):
             return target
-        step, scale = target - actions.origin, actions.steps
+        step, scale = target - actions.origin, actions.steps * actions.pace
         step = step / np.maximum(_most(step, scale), 1.0)
         return np.divide(step, scale, out=np.zeros_like(step), where=scale > 0.0)
 
 
 def _most(values: Floats, of: Floats) -> Floats:
-    """The largest ratio of an arm's values (N, J) to those of its joints that are not zero (J,), as a column (N, 1)."""
+    """The largest ratio of an arm's values (N, J) to those of its joints that are not zero, (J,) or (N, J), as a column."""
     ratio = np.divide(np.abs(values), of, out=np.zeros_like(values), where=of > 0.0)
     return ratio.max(axis=1, keepdims=True)
 
