@@ -100,7 +100,7 @@ class AnyTargetTask(Task):
         return workspace.configurations(position, quaternion if self.orientation else None)
 
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
-        """Joint positions and velocities, the poses of the tool and the target, and the parts of `ArmParts`."""
+        """Joint positions and velocities, the poses of the tool and the target, the guide, and the parts of `ArmParts`."""
         from gym_mara.tasks.arm_parts import ArmParts  # which takes long: it needs Pinocchio
 
         parts = [
