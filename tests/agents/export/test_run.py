@@ -89,7 +89,8 @@ def test_a_policy_of_joint_steps_gives_the_targets_of_the_environment(tmp_path: 
     observation, _ = env.reset(seed=0)
     for _ in range(30):
         action, q = policy.predict(observation)[0], env.simulation.backend.state.q[0]
-        targets = policy.targets(action, q)
+        pace = env.simulation.observation.split(observation)["pace"]
+        targets = policy.targets(action, q, pace=pace)
         np.testing.assert_allclose(targets, env.simulation.actions.targets(action[None])[0])
         observation, *_ = env.step(action.astype(np.float32))
         # Joints reach the targets of their steps within the period.
