@@ -141,6 +141,16 @@ def test_it_succeeds_at_almost_any_target() -> None:
     assert played["success_percent"].mean() >= 80.0
 
 
+def test_with_a_guide_it_moves_to_the_nearest_known_configuration() -> None:
+    ways = {}
+    for guide in (False, True):
+        options: dict[str, Any] = {"max_joint_velocity": 1.57, "guide": guide}
+        played = moved("MARAPose-v0", "pinocchio", options)
+        ways[guide] = np.abs(played.q[-1] - played.start).max(axis=1)
+        assert played.position_error[-1].max() < 2e-3
+    assert (ways[True] <= ways[False] + 0.01).all()
+
+
 def test_an_unknown_baseline_is_an_error() -> None:
     with pytest.raises(GymMaraError, match="unknown baseline 'ikk'"):
         evaluate_baseline("ikk", "MARA-v0", backend="pinocchio")
