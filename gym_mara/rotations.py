@@ -67,6 +67,14 @@ def angle_between(a: Floats, b: Floats) -> Floats:
     return two * xp.acos(xp.minimum(xp.abs(xp.vecdot(a, b)), one))
 
 
+def to_vector(q: Floats) -> Floats:
+    """The rotation vectors (..., 3), rad, of unit quaternions (..., 4) with w >= 0: the axis times the angle, at most π."""
+    xp, zero, _ = _ZERO_AND_ONE.like(q)
+    axis = q[..., 1:]
+    sine = xp.sqrt(xp.sum(axis * axis, axis=-1, keepdims=True))
+    return axis * (2.0 * xp.atan2(sine, q[..., :1]) / xp.maximum(sine, zero))
+
+
 def normalised(q: Floats) -> Floats:
     """Quaternions (..., 4) scaled to unit length."""
     xp = namespace(q)

@@ -140,3 +140,10 @@ def test_a_matrix_is_that_of_pinocchio_and_leads_back(q: Floats) -> None:
     (matrix,) = rotations.to_matrix(q[None])
     np.testing.assert_allclose(matrix, _matrix(q), rtol=0.0, atol=1e-12)
     assert _same_rotation(rotations.from_matrix(matrix[None])[0], rotations.canonical(q))
+
+
+@given(quaternions)
+def test_a_rotation_vector_is_that_of_pinocchio(q: Floats) -> None:
+    q = rotations.canonical(q)
+    np.testing.assert_allclose(pin.exp3(rotations.to_vector(q)), _matrix(q), rtol=0.0, atol=1e-9)
+    assert np.linalg.norm(rotations.to_vector(q)) <= np.pi + 1e-12

@@ -81,8 +81,8 @@ class Configurations:
         away = position - frames.position
         if self._rows == 3:
             return away, jacobian
-        turn = rotations.from_matrix(rotation @ frames.rotation.transpose(0, 2, 1))
-        sine = np.sqrt((turn[:, 1:] ** 2).sum(axis=1, keepdims=True))
-        turn = turn[:, 1:] * (2.0 * np.arctan2(sine, turn[:, :1]) / np.maximum(sine, 1e-9))
+        turn = rotations.to_vector(
+            rotations.from_matrix(rotation @ frames.rotation.transpose(0, 2, 1))
+        )
         scale = np.array([1.0] * 3 + [_LENGTH] * 3)[:, None]
         return np.concatenate([away, _LENGTH * turn], axis=1), jacobian * scale

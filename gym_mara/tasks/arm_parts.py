@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gym_mara import rotations
 from gym_mara.arrays import Constants
 from gym_mara.robot.clearance import FAR, Clearance
 from gym_mara.robot.kinematics import JointFrames
@@ -213,10 +214,7 @@ class ArmParts:
         if self._seen[0] is not state or self._seen[1] is not goal:
             frames = self._kinematics.joint_frames(state.q)
             error = goal.orientation_error(state.ee_quaternion)
-            xp, *_, small, _ = self._constants.like(error)
-            vector = error[:, 1:]
-            sine = xp.sqrt(xp.sum(vector * vector, axis=-1, keepdims=True))
-            turn = vector * (-2.0 * xp.atan2(sine, error[:, :1]) / xp.maximum(sine, small))
+            turn = -rotations.to_vector(error)
             looked = frames, goal.position - state.ee_position, turn, error
             self._seen = state, goal, looked, self._clearance(frames)
         return self._seen[2]  # type: ignore[no-any-return]
