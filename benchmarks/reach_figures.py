@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,23 +71,8 @@ def draw_curves(
     axes: Sequence[Axes] = figure.subplots(len(panels), 1, sharex=True)
     tables = [read_progress(run.progress_file) for run in runs]
     for axis, (column, (label, tolerance)) in zip(axes, panels.items(), strict=True):
-        for number, (run, rows) in enumerate(zip(runs, tables, strict=True)):
-            points = [(r["time/total_timesteps"], r[column]) for r in rows if column in r]
-            if not points:
-                raise GymMaraError(
-                    f"{str(run.progress_file)!r} has no {column}: give runs that were evaluated in their training"
-                )
-            steps, values = np.array(points).T
-            values = values if tolerance is None else np.maximum(values, SMALLEST)
-            smooth = in_windows(values, shares=tolerance is None)
-            axis.plot(steps, values, ".", color=f"C{number}", alpha=0.25, markeredgewidth=0.0)
-            axis.plot(steps, smooth, color=f"C{number}", label=f"seed {run.config.seed}")
+        draw_panel(axis, column, tolerance, runs, tables)
         axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
-        if tolerance is not None:
-            axis.set_yscale("log")
-            axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axis.axhline(tolerance, color=DARK, linestyle=":", linewidth=1.2, label="tolerance")
     axes[0].set_ylim(-4.0, 104.0)
     if baseline is not None:
         success = float(baseline["success_percent"].mean())
@@ -108,6 +93,36 @@ def draw_curves(
         frameon=False,
     )
     save(figure, file)
+
+
+def draw_panel(
+    axis: Axes,
+    column: str,
+    tolerance: float | None,
+    runs: Sequence[RunFolder],
+    tables: Sequence[Sequence[Mapping[str, float]]],
+) -> None:
+    """Draw a column of the tables of progress against steps; errors, which have a tolerance, on a logarithmic scale.
+
+    Raises:
+        GymMaraError: a run has no evaluations with this column.
+    """
+    for number, (run, rows) in enumerate(zip(runs, tables, strict=True)):
+        points = [(r["time/total_timesteps"], r[column]) for r in rows if column in r]
+        if not points:
+            raise GymMaraError(
+                f"{str(run.progress_file)!r} has no {column}: give runs that were evaluated in their training"
+            )
+        steps, values = np.array(points).T
+        values = values if tolerance is None else np.maximum(values, SMALLEST)
+        smooth = in_windows(values, shares=tolerance is None)
+        axis.plot(steps, values, ".", color=f"C{number}", alpha=0.25, markeredgewidth=0.0)
+        axis.plot(steps, smooth, color=f"C{number}", label=f"seed {run.config.seed}")
+    axis.grid(alpha=0.3)
+    if tolerance is not None:
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.axhline(tolerance, color=DARK, linestyle=":", linewidth=1.2, label="tolerance")
 
 
 def in_windows(values: Floats, *, shares: bool) -> Floats:

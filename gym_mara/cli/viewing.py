@@ -82,23 +82,13 @@ def watch(
     Needs the extra render, with a run also the extra train, and with an exported policy the extra deploy.
     """
     file = exported_file(run, policy, env)
-    if file is not None:
-        refuse(context, "only the policy of a run is filmed", "video", "targets")
-    elif run is None:
-        names = "policy", "video", "targets"
-        refuse(context, "without a run folder there is no policy to play", *names)
-    else:
-        refuse(context, "a run has its own environment", "env")
-    if video is None:
-        refuse(context, "the viewer has no end; only --video has a length", "seconds", "targets")
-        if not VIEWER_SPEEDS[0] <= speed <= VIEWER_SPEEDS[1]:
-            raise GymMaraError(
-                "--speed of the viewer must be from {:g} to {:g}, not {:g}".format(
-                    *VIEWER_SPEEDS, speed
-                )
+    _refuse_what_has_no_effect(context, run, file)
+    if video is None and not VIEWER_SPEEDS[0] <= speed <= VIEWER_SPEEDS[1]:
+        raise GymMaraError(
+            "--speed of the viewer must be from {:g} to {:g}, not {:g}".format(
+                *VIEWER_SPEEDS, speed
             )
-    if targets is not None:
-        refuse(context, "a video of several targets ends after the last one", "seconds")
+        )
     options = keyword_arguments(settings, pictures=video is not None, viewer=video is None)
     chosen = names_in("--backend", backend or [])
     if video is None and len(chosen) > 1:
@@ -139,6 +129,21 @@ def watch(
         return
     with interruptible("Closed."):
         watch_run(folder, backends[0], options, policy, speed, _print)
+
+
+def _refuse_what_has_no_effect(context: typer.Context, run: Path | None, file: Path | None) -> None:
+    """Refuse the options of `watch` that mean nothing with this run or this exported policy, or without any."""
+    if file is not None:
+        refuse(context, "only the policy of a run is filmed", "video", "targets")
+    elif run is None:
+        names = "policy", "video", "targets"
+        refuse(context, "without a run folder there is no policy to play", *names)
+    else:
+        refuse(context, "a run has its own environment", "env")
+    if not is_given(context, "video"):
+        refuse(context, "the viewer has no end; only --video has a length", "seconds", "targets")
+    if is_given(context, "targets"):
+        refuse(context, "a video of several targets ends after the last one", "seconds")
 
 
 def _print(note: str) -> None:
