@@ -1,8 +1,9 @@
 """The collision-free configurations of poses, searched for many poses at once.
 
-`gym_mara.robot.inverse_kinematics` finds one configuration, exactly and alone. Here many starts descend together, so that a new
-target costs about a millisecond, and most of its configurations are found: of MARA's about eight for a pose. (A position without
-an orientation has endlessly many, of which some are found.)
+`gym_mara.robot.inverse_kinematics` finds one configuration, exactly. Here many starts descend together: a pose takes about 8 ms
+alone, and less than 3 ms among others. Some of its configurations are found, but not all. Of 256 random poses none of MARA and UR5, and
+one of Panda, had none. The configuration that a pose was made of was among them in 88 % of the poses of MARA, and in 15 % of those
+of UR5, whose joints turn twice, and 35 % of those of Panda, which has endlessly many.
 """
 
 from __future__ import annotations
