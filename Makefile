@@ -33,8 +33,8 @@ bench: ## Measure speed. The other packages that it compares with pin an older M
 experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
 	$(BIN)/gym-mara benchmark --out runs/experiment
 
-test-oldest: ## Run the tests of environments, pictures and commands with the oldest supported Gymnasium.
-	$(MAKE) test VENV=.venv-oldest EXTRAS=test CONSTRAINTS=constraints-oldest.txt TESTS="$(GYMNASIUM_TESTS)"
+test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and commands with the oldest supported Gymnasium.
+	.venv-oldest/bin/python -m pytest -n auto -m "not slow and not nightly" $(GYMNASIUM_TESTS)
 
 test-rllib: ## Run the RLlib example, which pins an older Gymnasium, in a separate virtual environment.
 	$(MAKE) .venv-rllib/.ready VENV=.venv-rllib EXTRAS=rllib
@@ -56,4 +56,14 @@ GYMNASIUM_TESTS = $(filter-out $(OTHER_TESTS),$(wildcard tests/test_*.py)) tests
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python $(PIP_INSTALL) -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
+	touch $@
+
+# The oldest Gymnasium alone is installed here. All other packages are those of $(VENV).
+.venv-oldest/.ready: $(READY) constraints-oldest.txt
+	$(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python $(PIP_INSTALL) --no-deps -r constraints-oldest.txt
+	packages='import sysconfig; print(sysconfig.get_path("purelib"))'; \
+	others=$$($(BIN)/python -c "$$packages"); \
+	echo "import site; site.addsitedir('$$others')" >$$(.venv-oldest/bin/python -c "$$packages")/others.pth
+	.venv-oldest/bin/python -c 'import gymnasium; assert gymnasium.__version__.startswith("1.1."), gymnasium.__version__'
 	touch $@
