@@ -48,7 +48,7 @@ def measure(played: Trajectory) -> dict[str, Floats]:
     - `settling_ratio`: the settling time relative to the least time in which the joints' velocity limits allow a straight
       joint move from the start to the configuration in which the arm settled, max over joints |q_settled - q_start| / limit.
     - `tremble_mm`: the diagonal of the box, parallel to the world's axes, that holds the tool's path in the last HELD s.
-      `tremble_velocity`: the highest speed of a joint in this time, rad/s.
+      `tremble_velocity`: the highest speed of a joint in this time, rad/s. NaN in an episode that ends with a collision.
     - `action_rate`: the root mean square of the change of an action's components from one step to the next.
     - `highest_torque` of any joint, relative to its limit; `highest_velocity` of any joint, rad/s: the higher of the velocity
       at a step and the mean velocity since the step before.
@@ -64,7 +64,7 @@ def measure(played: Trajectory) -> dict[str, Floats]:
     time, ratio = _settling(played, lengths)
     speed = _speed(played)
     torque = np.abs(played.torque / played.effort_limit).max(axis=2)
-    end = _end(played, lengths)
+    end = _end(played, lengths) & ~played.collided[last]
     values = (
         position,
         np.where(free, position, np.nan),

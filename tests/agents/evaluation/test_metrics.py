@@ -178,6 +178,14 @@ def test_tremble_is_that_before_the_end_of_each_episode() -> None:
     check(trajectory(tool=tool, steps=steps), tremble_mm=[2.0, 0.0, NAN])
 
 
+def test_an_episode_that_ends_with_a_collision_does_not_tremble() -> None:
+    tool = np.cumsum(np.full((12, 2, 3), [0.003, 0.0, 0.004]), axis=0)
+    collided = np.zeros((12, 2), bool)
+    collided[11, 0] = collided[3, 1] = True  # the second arm was put back, and went on
+    played = trajectory(tool=tool, collided=collided)
+    check(played, tremble_mm=[NAN, 20.0], tremble_velocity=[NAN, 0.0])
+
+
 def test_a_joint_that_rests_at_every_step_has_moved_between_them() -> None:
     q = np.cumsum(np.full((10, 1, 2), [0.05, 0.02]), axis=0)
     check(trajectory(q=q), highest_velocity=0.5, tremble_velocity=0.5)

@@ -28,6 +28,18 @@ _TRAVELLING = Preset(
         "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.5},
     },
 )
+_ANY_TARGET = Preset(
+    num_envs=512,
+    normalise_observation=True,
+    arguments={
+        "n_steps": 16,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 0.25), (1.0, 0.0)),
+        "target_kl": 0.01,
+        "policy_kwargs": {"net_arch": [256, 256], "log_std_init": -0.5, "activation_fn": "ReLU"},
+    },
+)
 _PAPER = Preset(
     num_envs=8,
     arguments={
@@ -47,7 +59,7 @@ ALGORITHM = Algorithm(
     summary="actor-critic using Kronecker-factored trust region, our own",
     target="gym_mara.agents.algorithms.acktr:ACKTR",
     presets={
-        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "tuned": Presets(_TELEPORTING, _TRAVELLING, {"any_target": _ANY_TARGET}),
         "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(

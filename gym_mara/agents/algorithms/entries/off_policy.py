@@ -21,6 +21,18 @@ _TRAVELLING = _COMMON | {
     "tau": 0.01,
     "learning_rate": 7e-4,
 }
+_ANY_TARGET: dict[str, Any] = {
+    "buffer_size": 1_000_000,
+    "batch_size": 512,
+    "train_freq": 1,
+    "gradient_steps": 4,
+    "learning_starts": 10_000,
+    "gamma": 0.98,
+    "tau": 0.01,
+    "learning_rate": ((0.0, 7e-4), (1.0, 0.0)),
+    "ent_coef": "auto_0.1",
+    "policy_kwargs": {"net_arch": [256, 256]},
+}
 
 SEARCH_SPACE = SearchSpace(
     arguments={
@@ -37,4 +49,9 @@ def tuned(policy: str) -> Presets:
     return Presets(
         teleporting=Preset(num_envs=16, policy=policy, arguments=_TELEPORTING),
         travelling=Preset(num_envs=16, policy=policy, arguments=_TRAVELLING),
+        families={
+            "any_target": Preset(
+                num_envs=64, policy=policy, normalise_observation=True, arguments=_ANY_TARGET
+            )
+        },
     )

@@ -43,6 +43,26 @@ _TRAVELLING = Preset(
         },
     },
 )
+_ANY_TARGET = Preset(
+    num_envs=512,
+    normalise_observation=True,
+    arguments={
+        "n_steps": 16,
+        "batch_size": 2048,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
+        "target_kl": 0.01,
+        "cg_damping": 0.01,
+        "n_critic_updates": 3,
+        "policy_kwargs": {
+            "net_arch": [256, 256],
+            "log_std_init": -0.5,
+            "activation_fn": "ReLU",
+            "optimizer_class": "Adam",
+        },
+    },
+)
 _PAPER = Preset(
     num_envs=8,
     arguments={
@@ -65,7 +85,7 @@ ALGORITHM = Algorithm(
     summary="trust region policy optimisation, from sb3-contrib",
     target="sb3_contrib:TRPO",
     presets={
-        "tuned": Presets(teleporting=_TELEPORTING, travelling=_TRAVELLING),
+        "tuned": Presets(_TELEPORTING, _TRAVELLING, {"any_target": _ANY_TARGET}),
         "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
     },
     search_space=SearchSpace(
