@@ -15,6 +15,7 @@ from gym_mara.envs.streams import Streams, drawn_episodes
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import RobotModel
+from gym_mara.robot.joint_ranges import nearest_turns
 from gym_mara.tasks import Goal, Task
 from gym_mara.types import Array, Floats, Mask
 
@@ -112,6 +113,7 @@ class Episodes:
             self._workspace, host(position)[chosen], host(quaternion)[chosen]
         )
         if found is not None:
+            found = nearest_turns(self._robot, found, host(self.start)[chosen][:, None])
             known = np.full((self._num_envs, *found.shape[1:]), np.inf)
             if self.goal.configurations is not None:
                 known[...] = host(self.goal.configurations)

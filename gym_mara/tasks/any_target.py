@@ -64,13 +64,13 @@ class AnyTargetTask(Task):
     """The largest angle to the target that is a success, rad; used with `orientation`."""
     length_per_angle: float = 0.2
     """How much an angle counts beside a distance, m/rad."""
-    slow_within: float = 0.02
+    slow_within: float = 0.05
     """The error of position and angle together from which steps shrink in proportion to it, m: near the target an action is a
     part of the way, so that the arm comes to rest there."""
     rate_weight: float = 0.05
     """How much the change of actions costs."""
-    progress_weight: float = 0.4
-    """With `guide`: how much it counts how fast the joint with the longest way to the configuration approaches it, s/rad."""
+    progress_weight: float = 3.0
+    """With `guide`: how much it counts how fast the arm moves straight to the configuration, s/rad."""
     collision_weight: float = 100.0
     """How much a collision costs."""
 
@@ -157,9 +157,18 @@ class AnyTargetTask(Task):
 
 
 def _approach(state: SimState, goal: Goal) -> Floats:
-    """The speed (N,), rad/s (m/s), at which the joint with the longest way to the nearest configuration approaches it."""
+    """How fast the arm moves straight to the nearest configuration (N,), rad/s (m/s); 0 where none is known.
+
+    The speed at which the joint with the longest way approaches it, less the largest deviation of a joint's velocity from that
+    with which all joints would arrive together.
+    """
     way = goal.ways(state.q)
-    xp, _ = _ONE.like(way)
-    joint = xp.argmax(xp.abs(way), axis=-1)
-    row = xp.arange(len(joint), device=joint.device)
-    return state.qd[row, joint] * xp.sign(way[row, joint])
+    xp, one = _ONE.like(way)
+    size = xp.abs(way)
+    longest = xp.argmax(size, axis=-1)
+    row = xp.arange(len(longest), device=longest.device)
+    far = size[row, longest]
+    ahead = way / xp.where(far > 0.0, far, one)[:, None]
+    speed = state.qd[row, longest] * ahead[row, longest]
+    deviation = xp.max(xp.abs(state.qd - speed[:, None] * ahead), axis=-1)
+    return xp.where(far > 0.0, speed - deviation, zeros_like(speed))

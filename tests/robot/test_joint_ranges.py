@@ -11,7 +11,7 @@ from gym_mara.collision.free_poses import FreePoses, reachable_pose
 from gym_mara.envs import MaraEnv
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
-from gym_mara.robot.joint_ranges import action_range, reachable_range
+from gym_mara.robot.joint_ranges import action_range, nearest_turns, reachable_range
 from tests.helpers import joint_xml, robot_model, urdf_xml, write
 
 
@@ -50,6 +50,23 @@ def test_limits_that_are_pi_but_for_rounding_stay_pi() -> None:
     low, high = action_range(mara)
     np.testing.assert_array_equal([low, high], [np.full(6, -np.pi), np.full(6, np.pi)])
     assert [end[0] for end in reachable_range(mara)] == [-np.pi, np.pi]
+
+
+def test_whole_turns_bring_joints_as_near_as_their_limits_allow(tmp_path: Path) -> None:
+    arm = _arm(tmp_path, -2 * np.pi, 2 * np.pi)
+    near = np.array([[3.0, 0.0], [6.0, 0.0], [-6.0, 0.0], [0.0, 0.0]])
+    q = np.array([[-3.0, 1.0], [-1.0, 1.0], [1.0, 1.0], [3.0, 1.0]])
+    expected = [2 * np.pi - 3.0, 2 * np.pi - 1.0, 1.0 - 2 * np.pi, 3.0]
+    turned = nearest_turns(arm, q, near)
+    np.testing.assert_allclose(turned, np.column_stack([expected, np.ones(4)]), atol=1e-12)
+    unknown = np.full((4, 2), np.inf)
+    np.testing.assert_array_equal(nearest_turns(arm, unknown, near), unknown)
+    still = nearest_turns(
+        _arm(tmp_path, -np.pi / 2, np.pi / 2), np.array([[-1.5, 0.0]]), np.array([[1.5, 0.0]])
+    )
+    assert still.tolist() == [[-1.5, 0.0]]
+    rail = _arm(tmp_path, -20.0, 20.0, "prismatic")
+    assert nearest_turns(rail, np.array([[-3.0, 0.0]]), np.array([[3.0, 0.0]]))[0, 0] == -3.0
 
 
 def test_targets_are_drawn_from_the_whole_travel_of_a_long_rail(tmp_path: Path) -> None:

@@ -76,20 +76,23 @@ def test_the_terms_add_up_with_their_weights() -> None:
     assert reward == pytest.approx(sum(float(terms[name][0]) for name in parts))
 
 
-def test_with_a_guide_the_joint_with_the_longest_way_is_rewarded_for_its_speed() -> None:
+def test_with_a_guide_the_straight_move_to_the_configuration_is_rewarded_for_its_speed() -> None:
     task = AnyTargetTask(guide=True, progress_weight=2.0)
     ways = np.array([0.1, -0.9, 0.3, 0.0, 0.0, 0.0])
     others = np.full(6, np.inf), np.full(6, 1.5)
     known = np.stack([others[0], ways, others[1]])[None]
     goal = Goal(ORIGIN.position, ORIGIN.quaternion, known)
-    speed = np.array([[0.7, -0.25, 0.1, 0.0, 0.0, 0.0]])
-    _, terms = task.reward(_at(qd=speed), goal)
-    assert terms["reward_progress"].tolist() == [2.0 * 0.25]
-    _, terms = task.reward(_at(qd=-speed), goal)
-    assert terms["reward_progress"].tolist() == [-2.0 * 0.25]
+
+    def progress(qd: Floats, goal: Goal = goal) -> float:
+        return float(task.reward(_at(qd=qd[None]), goal)[1]["reward_progress"][0])
+
+    assert progress(ways) == pytest.approx(2.0 * 0.9)
+    assert progress(-0.5 * ways) == pytest.approx(-2.0 * 0.45)
+    beside = np.array([0.2, 0.0, 0.0, 0.0, 0.0, -0.3])
+    assert progress(ways + beside) == pytest.approx(2.0 * (0.9 - 0.3))
+    assert progress(0.0 * ways) == 0.0
     nowhere = Goal(goal.position, goal.quaternion, np.full((1, 2, 6), np.inf))
-    _, terms = task.reward(_at(qd=speed), nowhere)
-    assert terms["reward_progress"].tolist() == [0.0]
+    assert progress(ways, nowhere) == 0.0
 
 
 @pytest.mark.parametrize(
