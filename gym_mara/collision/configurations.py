@@ -12,9 +12,9 @@ import numpy as np
 
 from gym_mara import rotations
 from gym_mara.collision.coal import CoalChecker
-from gym_mara.collision.free_poses import ROOM
+from gym_mara.collision.free_poses import ROOM, straight_move
 from gym_mara.robot import RobotModel
-from gym_mara.robot.joint_ranges import reachable_range
+from gym_mara.robot.joint_ranges import nearest_turns, reachable_range
 from gym_mara.types import Floats
 
 STARTS = 32
@@ -28,6 +28,8 @@ _DAMPING = 0.025
 """Of the least squares, relative to the largest error, m."""
 _REACHED = 1e-3
 """The largest error of a configuration, m."""
+_WAYS = 6
+"""How many of the nearest configurations are tried for a free way."""
 
 
 class Configurations:
@@ -39,22 +41,45 @@ class Configurations:
     """
 
     def __init__(self, robot: RobotModel, orientation: bool) -> None:
-        self._kinematics = robot.kinematics()
-        self._checker = CoalChecker(robot, np.full(robot.num_joints, ROOM))
+        self._robot, self._kinematics = robot, robot.kinematics()
+        self._free = CoalChecker(robot)
+        self._with_room = self._free.with_margin(np.full(robot.num_joints, ROOM))
         self._low, self._high = reachable_range(robot)
         self._rows = 6 if orientation else 3
         starts = (STARTS, robot.num_joints)
         self._starts = np.random.default_rng(0).uniform(self._low, self._high, starts)
 
-    def __call__(self, position: Floats, quaternion: Floats | None) -> Floats:
+    def __call__(self, position: Floats, quaternion: Floats | None, start: Floats) -> Floats:
         """Configurations (N, STARTS, J), rad (m), of poses; infinite where the search ends elsewhere or in a collision.
 
-        Each joint can turn by ROOM around them without a collision.
+        Each joint can turn by ROOM around them without a collision, and has the whole turns that bring it nearest to the start.
+        On the straight way from the start to the nearest one there is no collision, unless there is one on the ways to all
+        that were tried: nearer ones are left out.
 
         Args:
             position: of the end effector in the world (N, 3), m.
             quaternion: its orientation (N, 4), [w, x, y, z]; not read without orientations.
+            start: from where the arms begin (N, J), rad (m).
         """
+        q = self._search(position, quaternion)
+        q = nearest_turns(self._robot, q, start[:, None])
+        for own, begin in zip(q, start, strict=True):
+            own[self._blocked(own, begin)] = np.inf
+        return q
+
+    def _blocked(self, q: Floats, start: Floats) -> list[int]:
+        """Which configurations (K, J) are nearer than the first one with a free straight way from the start (J,)."""
+        farthest = np.abs(q - start).max(axis=1)
+        nearer = []
+        for index in np.argsort(farthest)[:_WAYS].tolist():
+            if not np.isfinite(farthest[index]):
+                break
+            if not self._free.check(straight_move(start, q[index])).any():
+                return nearer
+            nearer.append(index)
+        return []
+
+    def _search(self, position: Floats, quaternion: Floats | None) -> Floats:
         if quaternion is None:
             quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(position), 1))
         q = np.tile(self._starts, (len(position), 1))
@@ -71,7 +96,7 @@ class Configurations:
         found = np.abs(self._look(q, aim, turned)[0]).max(axis=1) < _REACHED
         reached = np.flatnonzero(found)
         if len(reached):
-            found[reached] = ~self._checker.check(q[reached])
+            found[reached] = ~self._with_room.check(q[reached])
         q[~found] = np.inf
         return q.reshape(len(position), STARTS, -1)
 

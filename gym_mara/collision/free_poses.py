@@ -61,18 +61,12 @@ class FreePoses:
             if begin is None:
                 begin = self._free_configuration(generator, self._with_room)
             end = self._free_configuration(generator, self._with_room)
-            if not self._checker.check(self._move(begin, end)).any():
+            if not self._checker.check(straight_move(begin, end)).any():
                 return begin, *self._pose(end)
         raise GymMaraError(
             f"{self._robot.name} collides on all of {_TRIES} random joint moves"
             + ("" if start is None else f" from {start.tolist()}: choose another start_q")
         )
-
-    def _move(self, begin: Floats, end: Floats) -> Floats:
-        """The configurations before the end of a straight joint move (K, J), at most _STEP apart."""
-        way = end - begin
-        count = math.ceil(float(np.abs(way).max()) / _STEP)
-        return begin + np.linspace(0.0, 1.0, count + 1)[:-1, None] * way
 
     def _pose(self, q: Floats) -> tuple[Floats, Floats]:
         position, quaternion = self._kinematics.pose(q[None])
@@ -89,6 +83,13 @@ class FreePoses:
             f"{self._robot.name} collides at all of {_TRIES} random configurations; "
             "check which pairs of links its SRDF disables"
         )
+
+
+def straight_move(begin: Floats, end: Floats) -> Floats:
+    """The configurations before the end of a straight joint move (K, J), at most _STEP apart; the first one if it ends there."""
+    way = end - begin
+    count = max(1, math.ceil(float(np.abs(way).max()) / _STEP))
+    return begin + np.linspace(0.0, 1.0, count + 1)[:-1, None] * way
 
 
 def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:

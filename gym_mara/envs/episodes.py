@@ -15,7 +15,6 @@ from gym_mara.envs.streams import Streams, drawn_episodes
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import RobotModel
-from gym_mara.robot.joint_ranges import nearest_turns
 from gym_mara.tasks import Goal, Task
 from gym_mara.types import Array, Floats, Mask
 
@@ -44,6 +43,7 @@ class Episodes:
         self._usual_start = asarray(np.tile(robot.checked_q(start, "start_q"), (num_envs, 1)))
         self.start: Floats = self._usual_start
         """The start configurations (N, J), rad."""
+        self._aimed_from = self.start
         poses = self.first_goal.position, self.first_goal.quaternion
         self.goal = Goal(*map(asarray, poses))
         """The goals of the N arms."""
@@ -85,48 +85,58 @@ class Episodes:
             new = [where(rows, values, kept) for values, kept in zip(new, old, strict=False)]
         self.start, *goal = new
         if goal:
-            self._aim(goal, mask)
+            self._aim(goal, mask, self.start)
 
     def _chosen(self, mask: Mask | None) -> Mask:
         return np.ones(self._num_envs, np.bool_) if mask is None else host(mask)
 
-    def set_goal(self, position: ArrayLike, quaternion: ArrayLike) -> None:
-        """Set the goal of every arm, as `Simulation.set_goal` does."""
+    def set_goal(self, position: ArrayLike, quaternion: ArrayLike, q: Floats) -> None:
+        """Set the goal of every arm, as `Simulation.set_goal` does; the arms are at q (N, J), rad (m)."""
         point = finite_numbers("position", position, 3)
         turn = np.array(finite_numbers("quaternion", quaternion, 4))
         if not np.linalg.norm(turn) > 1e-6:
             raise GymMaraError(f"a quaternion must not be zero, as {turn.tolist()} is")
         turn = rotations.canonical(rotations.normalised(turn))
         poses = [like(np.tile(each, (self._num_envs, 1)), self.start) for each in (point, turn)]
-        self._aim(poses, None)
+        self._aim(poses, None, q)
 
-    def _aim(self, goals: Sequence[Floats], mask: Mask | None) -> None:
+    def _aim(self, goals: Sequence[Floats], mask: Mask | None, q: Floats) -> None:
         """Set the goals, with the configurations that the task needs there.
 
         Args:
             goals: positions (N, 3) and quaternions (N, 4).
             mask: the arms whose goals are new (N,); None for all.
+            q: where the arms are (N, J), rad (m).
         """
         position, quaternion = goals
         chosen = self._chosen(mask)
         found = self._task.configurations(
-            self._workspace, host(position)[chosen], host(quaternion)[chosen]
+            self._workspace, *(host(each)[chosen] for each in (position, quaternion, q))
         )
         if found is not None:
-            found = nearest_turns(self._robot, found, host(self.start)[chosen][:, None])
             known = np.full((self._num_envs, *found.shape[1:]), np.inf)
             if self.goal.configurations is not None:
                 known[...] = host(self.goal.configurations)
             known[chosen] = found
             found = like(known, self.start)
         self.goal = Goal(position, quaternion, found)
+        if mask is not None:
+            q = namespace(q).where(mask[:, None], q, self._aimed_from)
+        self._aimed_from = q
 
     def save(self) -> dict[str, Any]:
         """A snapshot of the starts and the goals, of NumPy's arrays."""
         goal = host(self.goal.position), host(self.goal.quaternion)
-        return {"goal": goal, "start": host(self.start).copy()}
+        return {
+            "goal": goal,
+            "start": host(self.start).copy(),
+            "aimed_from": host(self._aimed_from).copy(),
+        }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of the form of `save`; it may have other entries."""
-        self._aim([like(values.copy(), self.start) for values in snapshot["goal"]], None)
+        *goal, aimed_from = (
+            like(values.copy(), self.start) for values in (*snapshot["goal"], snapshot["aimed_from"])
+        )
+        self._aim(goal, None, aimed_from)
         self.start = like(snapshot["start"].copy(), self.start)

@@ -224,7 +224,7 @@ class Simulation:
         Raises:
             GymMaraError: a value has another shape or is not finite, or the quaternion is zero. The goal stays then.
         """
-        self.episodes.set_goal(position, quaternion)
+        self.episodes.set_goal(position, quaternion, self.backend.state.q)
 
     def switch_backend(self, name: str) -> None:
         """Continue in another backend, at rest at the current joint positions.

@@ -47,12 +47,15 @@ class RobotWorkspace:
         """
         return Draw(*self._poses.draw_move(generator, start))
 
-    def configurations(self, position: Floats, quaternion: Floats | None) -> Floats:
-        """Collision-free configurations (N, K, J), rad (m), at N poses or positions; infinite where fewer are found."""
+    def configurations(self, position: Floats, quaternion: Floats | None, start: Floats) -> Floats:
+        """Collision-free configurations (N, K, J), rad (m), at N poses or positions; infinite where fewer are found.
+
+        On the straight way from the start (N, J) to the nearest one there is no collision, if that can be had.
+        """
         posed = quaternion is not None
         if posed not in self._configurations:
             self._configurations[posed] = Configurations(self._robot, posed)
-        return self._configurations[posed](position, quaternion)
+        return self._configurations[posed](position, quaternion, start)
 
     @property
     def _poses(self) -> FreePoses:

@@ -93,11 +93,11 @@ class AnyTargetTask(Task):
         return workspace.draw_move(generator, np.array(start) if fixed else None)
 
     def configurations(
-        self, workspace: Workspace, position: Floats, quaternion: Floats
+        self, workspace: Workspace, position: Floats, quaternion: Floats, start: Floats
     ) -> Floats | None:
         if not self.guide:
             return None
-        return workspace.configurations(position, quaternion if self.orientation else None)
+        return workspace.configurations(position, quaternion if self.orientation else None, start)
 
     def observation(self, robot: RobotModel, goal: Goal, joint_velocity: Floats) -> Sequence[Part]:
         """Joint positions and velocities, the poses of the tool and the target, the guide, and the parts of `ArmParts`."""

@@ -50,8 +50,11 @@ class Workspace(Protocol):
         No collision is on the straight joint move from the one to the other.
         """
 
-    def configurations(self, position: Floats, quaternion: Floats | None) -> Floats:
-        """Collision-free configurations (N, K, J), rad (m), at N poses; infinite where fewer are found."""
+    def configurations(self, position: Floats, quaternion: Floats | None, start: Floats) -> Floats:
+        """Collision-free configurations (N, K, J), rad (m), at N poses; infinite where fewer are found.
+
+        On the straight way from the start (N, J) to the nearest one there is no collision, if that can be had.
+        """
 
     def default_pose(self) -> tuple[Floats, Floats]:
         """The pose of a collision-free configuration, always the same for a robot."""
@@ -153,7 +156,7 @@ class Task(ABC):
         return Draw(None, *self.draw_goal(workspace, generator))
 
     def configurations(
-        self, workspace: Workspace, position: Floats, quaternion: Floats
+        self, workspace: Workspace, position: Floats, quaternion: Floats, start: Floats
     ) -> Floats | None:
         """The configurations (N, K, J) at goals that the observation or the reward needs; None by default.
 
@@ -161,6 +164,7 @@ class Task(ABC):
             workspace: the poses that the arm can reach.
             position: of the goals (N, 3), m.
             quaternion: of the goals (N, 4), [w, x, y, z].
+            start: where the arms are (N, J), rad (m).
         """
         return None
 
