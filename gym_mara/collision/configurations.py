@@ -70,7 +70,7 @@ class Configurations:
     def _blocked(self, q: Floats, start: Floats) -> list[int]:
         """Which configurations (K, J) are nearer than the first one with a free straight way from the start (J,)."""
         farthest = np.abs(q - start).max(axis=1)
-        nearer = []
+        nearer: list[int] = []
         for index in np.argsort(farthest)[:_WAYS].tolist():
             if not np.isfinite(farthest[index]):
                 break

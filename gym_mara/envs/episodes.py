@@ -136,7 +136,8 @@ class Episodes:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of the form of `save`; it may have other entries."""
         *goal, aimed_from = (
-            like(values.copy(), self.start) for values in (*snapshot["goal"], snapshot["aimed_from"])
+            like(values.copy(), self.start)
+            for values in (*snapshot["goal"], snapshot["aimed_from"])
         )
         self._aim(goal, None, aimed_from)
         self.start = like(snapshot["start"].copy(), self.start)

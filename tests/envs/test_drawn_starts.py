@@ -129,6 +129,27 @@ def test_the_guide_leads_to_the_target_and_follows_it() -> None:
     assert follow().max() < 5e-3
 
 
+@pytest.mark.parametrize("robot", ["mara", "ur5"])
+def test_the_guides_straight_way_is_free_from_where_the_arm_is(robot: str) -> None:
+    envs = MaraVectorEnv(40, "MARAPose-v0", robot=robot, guide=True)
+    envs.reset(seed=0)
+    simulation = envs.simulation
+    checker = make_checker("coal", simulation.robot)
+
+    def blocked() -> int:
+        q = simulation.backend.state.q
+        steps = np.linspace(0.0, 1.0, 100)[:, None]
+        ways = zip(q, simulation.goal.ways(q), strict=True)
+        return sum(bool(checker.check(each + steps * way).any()) for each, way in ways)
+
+    # Between two checks an arm may graze itself.
+    assert blocked() <= 1
+    home = simulation.robot.home[None]
+    position, quaternion = simulation.robot.kinematics().pose(home + 0.3)
+    simulation.set_goal(position[0], quaternion[0])  # as in the viewer, far from the starts
+    assert blocked() <= 2
+
+
 def test_with_a_guide_a_snapshot_and_a_copy_go_on_alike() -> None:
     env = MaraEnv("MARAPose-v0", guide=True)
     env.reset(seed=1)
