@@ -1,0 +1,11 @@
+"""gym-mara ros2: an arm behind topics, simulated or real."""
+
+from __future__ import annotations
+
+import typer
+
+app = typer.Typer(
+    name="ros2",
+    help="Connect policies to an arm of ROS 2, simulated or real.",
+    no_args_is_help=True,
+)

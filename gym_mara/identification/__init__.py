@@ -1,0 +1,1 @@
+"""The parameters of a simulated arm that make it follow the motion of a real one best."""
