@@ -22,6 +22,8 @@ class Environment(NamedTuple):
     """The length of its episodes, steps."""
     goals: bool = False
     """Whether it is a goal environment: its classes are MaraGoalEnv and MaraGoalVectorEnv, else MaraEnv and MaraVectorEnv."""
+    backend: str | None = None
+    """Its usual backend; None for that of the package."""
 
 
 ENVIRONMENTS: dict[str, Environment] = {}
@@ -69,6 +71,8 @@ def register_environments() -> None:
     for name, task in list(TASKS.items()):
         register_task(name, task)
     _register("MARAGoal-v0", Environment("MARARandomTarget-v0", 50, goals=True), {})
+    real = {"task": "MARA-v0", "backend": "ros2"}
+    _register("MARAReal-v0", Environment(max_episode_steps=MAX_EPISODE_STEPS, **real), real)
 
 
 def environment_id(name: str) -> str:

@@ -53,6 +53,9 @@ class SimState:
     fills this field and the next one; a backend leaves both None."""
     last_action: Floats | None = None
     """The action before it (N, A)."""
+    timing: Mapping[str, Floats] | None = None
+    """How punctual the last step of a real arm was, each (N,): `lateness`, how long after its tick the action came, s;
+    `missed_ticks`, how many control periods passed without an action; `state_age`, s. None in a simulation."""
 
     def __init__(
         self,
@@ -69,6 +72,7 @@ class SimState:
         parameters: Mapping[str, Floats] | None = None,
         action: Floats | None = None,
         last_action: Floats | None = None,
+        timing: Mapping[str, Floats] | None = None,
     ) -> None:
         # The constructor that a frozen dataclass generates takes almost twice as long, and every step makes a state.
         vars(self).update(
@@ -85,6 +89,7 @@ class SimState:
             parameters=parameters,
             action=action,
             last_action=last_action,
+            timing=timing,
         )
 
     def with_q(self, q: Floats) -> SimState:

@@ -7,6 +7,7 @@ from gym_mara.backends.registry import (
     backend_settings,
     installed_backends,
     make_backend,
+    simulated_backends,
     usable_backends,
 )
 
@@ -17,5 +18,6 @@ __all__ = [
     "backend_settings",
     "installed_backends",
     "make_backend",
+    "simulated_backends",
     "usable_backends",
 ]

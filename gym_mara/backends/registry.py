@@ -25,7 +25,10 @@ _BACKENDS = {
     "dart": "gym_mara.backends.dart:DartBackend",
     "mujoco": "gym_mara.backends.mujoco:MujocoBackend",
     "warp": "gym_mara.backends.warp:WarpBackend",
+    "ros2": "gym_mara.backends.ros2:Ros2Backend",
 }
+_REAL = ("ros2",)
+"""Those that move an arm in the real world, or one that another program simulates."""
 
 
 def _find(name: str) -> EntryPoint | None:
@@ -37,6 +40,11 @@ def _find(name: str) -> EntryPoint | None:
 def backend_names() -> list[str]:
     """The names that `make_backend` knows; no engine is imported."""
     return sorted({*_BACKENDS, *(e.name for e in entry_points(group=_GROUP))})
+
+
+def simulated_backends() -> list[str]:
+    """The names of the backends that simulate arms themselves."""
+    return [name for name in backend_names() if name not in _REAL]
 
 
 def backend_class(name: str) -> type[Backend]:
@@ -86,19 +94,19 @@ def backend_settings(name: str) -> list[str]:
 
 
 def installed_backends() -> tuple[list[str], list[str]]:
-    """The names of the backends that can be imported here, and for each of the others the reason why not."""
+    """The names of the simulated backends that can be imported here, and for each of the others the reason why not."""
     return _those_that(backend_class)
 
 
 def usable_backends() -> tuple[list[str], list[str]]:
-    """The names of the backends that work on this machine by default, and for each of the others the reason why not."""
+    """The names of the simulated backends that work on this machine by default, and for each of the others the reason why not."""
     return _those_that(lambda name: backend_class(name).require_machine())
 
 
 def _those_that(check: Callable[[str], object]) -> tuple[list[str], list[str]]:
     """The names of the backends that pass a check, and the errors of the others."""
     passed, reasons = [], []
-    for name in backend_names():
+    for name in simulated_backends():
         try:
             check(name)
             passed.append(name)

@@ -23,14 +23,14 @@ class Outcome(NamedTuple):
     truncated: Mask | None
     """Whether the arm's state diverged (N,); None if no arm's did."""
     info: dict[str, NDArray[Any]]
-    """The task's reward terms and `collided`, each (N,); torques, contacts and random parameters, each (N, …), if the
-    state has them."""
+    """The task's reward terms and `collided`, each (N,); torques, contacts, random parameters and timing, each (N, …),
+    if the state has them."""
     state: SimState
     """The state that the task rewarded; for an arm that collided, its colliding configuration."""
 
 
 def report(state: SimState) -> dict[str, NDArray[Any]]:
-    """The torques, contacts and random parameters of a state, for `info`, each (N, …)."""
+    """The torques, contacts, random parameters and timing of a state, for `info`, each (N, …)."""
     values: dict[str, NDArray[Any]] = {}
     if state.torque is not None:
         values["joint_torque"] = state.torque
@@ -41,4 +41,6 @@ def report(state: SimState) -> dict[str, NDArray[Any]]:
         values["contacts"] = contacts
     if state.parameters is not None:
         values |= state.parameters
+    if state.timing is not None:
+        values |= state.timing
     return values

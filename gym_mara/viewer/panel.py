@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from gym_mara.backends import backend_names
+from gym_mara.backends import simulated_backends
 from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.simulation import Simulation
 from gym_mara.types import Floats
@@ -44,9 +44,9 @@ class Panel:
         self._speed = gui.add_slider(
             "Speed", min=0.1, max=5.0, step=0.1, initial_value=1.0, hint="1 is real time"
         )
-        self.backends = gui.add_dropdown(
-            "Backend", backend_names(), initial_value=simulation.backend_name
-        )
+        current = simulation.backend_name
+        names = dict.fromkeys([*simulated_backends(), current])
+        self.backends = gui.add_dropdown("Backend", [*names], initial_value=current)
         with gui.add_folder("Joints, rad"):
             self.jogging = gui.add_checkbox("Jog", initial_value=False)
             # Rounded outwards, because a long number is cut off; `targets` clips to the true limits.

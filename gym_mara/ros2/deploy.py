@@ -1,0 +1,261 @@
+"""Plays an exported policy on an arm behind topics: observes, acts, and follows the targets that it is given."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from gym_mara.backends.ros2 import Ros2Backend
+from gym_mara.deploy import OnnxPolicy
+from gym_mara.envs import make_vector_env
+from gym_mara.envs.streams import Streams
+from gym_mara.errors import GymMaraError
+from gym_mara.ros2.driver import ArmStoppedError, Timing
+from gym_mara.types import Floats
+
+if TYPE_CHECKING:
+    from gym_mara.ros2.node import RosNode
+
+_WAIT = 0.05
+"""How often a deployment that waits looks for a target or a resume, s."""
+
+
+class Target(NamedTuple):
+    """A pose of the tool in the world."""
+
+    position: tuple[float, ...]
+    """(3,), m."""
+    quaternion: tuple[float, ...] | None = None
+    """(4,), [w, x, y, z]; None for a position alone."""
+
+
+class Diagnostics(NamedTuple):
+    """What a deployment reports about itself."""
+
+    status: str
+    """What the arm does: "waits for a target", "moves", or why it has stopped."""
+    steps: int
+    missed_ticks: int
+    """Of the policy, control periods."""
+    lateness: tuple[float, float]
+    """How long after its tick an action came, s: the median and the 99th percentile of the last actions."""
+    state_age: float
+    """Of the last state, s."""
+    refused: dict[str, int]
+    """How many messages of the arm were refused, by reason."""
+    setpoints: Timing
+    """Of the thread that sends set-points."""
+    error: float | None
+    """The distance to the target, m; None where there is none yet."""
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The figures with their names, as text."""
+        late, ticks = self.lateness, self.setpoints
+        refused = ", ".join(f"{reason} {count}" for reason, count in self.refused.items())
+        return [
+            ("distance to the target, mm", "-" if self.error is None else f"{1e3 * self.error:.3f}"),
+            ("actions", f"{self.steps:,}"),
+            ("missed control periods", f"{self.missed_ticks:,}"),
+            ("lateness of actions, p50 and p99, ms", f"{1e3 * late[0]:.2f}, {1e3 * late[1]:.2f}"),
+            ("set-points", f"{ticks.ticks:,}"),
+            ("missed set-points", f"{ticks.missed:,}"),
+            (
+                "jitter of set-points, p50, p99 and largest, ms",
+                ", ".join(f"{1e3 * value:.2f}" for value in ticks.lateness),
+            ),
+            ("age of the arm's state, ms", f"{1e3 * self.state_age:.1f}"),
+            ("refused messages", refused or "none"),
+        ]
+
+
+class Deployment:
+    """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target.
+
+    Args:
+        policy: the policy.
+        env: the name of an environment; None for that of the training.
+        options: keyword arguments of the environment with the backend "ros2", which replace those of the training.
+        log: is called with a sentence about a refused target and about each stop.
+
+    Raises:
+        GymMaraError: the policy does not fit the environment, an option is unknown, there is no arm, or it cannot be moved.
+        MissingExtraError: ROS 2 or a library is missing.
+    """
+
+    def __init__(
+        self,
+        policy: OnnxPolicy,
+        env: str | None,
+        options: dict[str, Any],
+        log: Callable[[str], None],
+    ) -> None:
+        self.policy, self._log = policy, log
+        keywords = policy.keywords(env, "ros2", **options)
+        keywords.setdefault("on_collision", "continue")
+        self._arms = make_vector_env(env or policy.about.env, 1, **keywords)
+        self.simulation = simulation = self._arms.simulation
+        assert isinstance(simulation.backend, Ros2Backend)
+        self.backend: Ros2Backend = simulation.backend
+        simulation.streams = (Streams.of(np.random.default_rng(0)),)
+        self.follows = simulation.task.random_goal
+        """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
+        self.oriented = bool(getattr(simulation.task, "orientation", False))
+        """Whether targets have an orientation."""
+        self._asked: Target | None = None
+        self._target: Target | None = None
+        self._lock = threading.Lock()
+        self._ended = False
+        self._steps, self._missed = 0, 0
+        self._lateness: list[float] = []
+        self._status, self._error = "waits for a target", None
+        try:
+            policy.check(self._arms)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def node(self) -> RosNode:
+        """The node of the connection to the arm."""
+        from gym_mara.ros2.link import RosLink  # it imports ROS
+
+        link = self.backend.driver.link
+        assert isinstance(link, RosLink)
+        return link.node
+
+    def aim(self, target: Target) -> None:
+        """Reach for a target from the next step on. It may be called from any thread.
+
+        Raises:
+            GymMaraError: the task has a target of its own.
+        """
+        if not self.follows:
+            raise GymMaraError(
+                f"{self.policy.about.env} has a target of its own, so that it follows no other"
+            )
+        with self._lock:
+            self._asked = target
+
+    def stop(self, reason: str) -> None:
+        """Decelerate to a hold until `resume`. It may be called from any thread."""
+        self.backend.driver.stop(reason)
+
+    def resume(self) -> None:
+        """Move again, from where the arm is. It may be called from any thread.
+
+        Raises:
+            GymMaraError: the arm cannot move from there.
+        """
+        self.backend.driver.resume()
+
+    def end(self) -> None:
+        """Let `run` return. It may be called from any thread and by a signal handler."""
+        self._ended = True
+
+    def run(self, seconds: float | None = None) -> None:
+        """Play the policy.
+
+        Args:
+            seconds: how long; None until `end` is called.
+
+        Raises:
+            GymMaraError: the arm cannot be driven any more.
+        """
+        end = np.inf if seconds is None else time.monotonic() + seconds
+        while not self._ended and time.monotonic() < end:
+            if not self.follows or self._take_target(None):
+                self._episode(end)
+            else:
+                self._status = "waits for a target"
+                time.sleep(_WAIT)
+
+    def _take_target(self, observation: Any) -> bool:
+        """Whether there is a target; a new one is checked first, and the old one stays where it is refused."""
+        with self._lock:
+            asked, self._asked = self._asked, None
+        if asked is not None:
+            try:
+                self.simulation.episodes.given(_as_options(asked))
+            except GymMaraError as error:
+                self._log(f"the target {[*asked.position]} is refused: {error}")
+            else:
+                self._target = asked
+                if observation is not None:
+                    quaternion = asked.quaternion or (1.0, 0.0, 0.0, 0.0)
+                    self.simulation.set_goal(asked.position, quaternion)
+        return self._target is not None
+
+    def _episode(self, end: float) -> None:
+        """Play from where the arm is, until a stop or the end."""
+        simulation = self.simulation
+        try:
+            observation = self._begin()
+            self._status = "moves"
+            while not self._ended and time.monotonic() < end:
+                if self.follows:
+                    self._take_target(observation)
+                action, _ = self.policy.predict(simulation.present(observation))
+                outcome = simulation.step(action)
+                observation = outcome.observation
+                self._note(outcome.info)
+                self.backend.driver.check()
+        except ArmStoppedError as error:
+            self._wait_for_resume(error, end)
+
+    def _begin(self) -> Floats:
+        """Begin an episode at the measured pose, and return the observation (1, O)."""
+        simulation = self.simulation
+        q = np.clip(self.backend.state.q, simulation.robot.lower, simulation.robot.upper)
+        options: dict[str, Any] = {"start_q": q[0].tolist()}
+        if self._target is not None:
+            options |= _as_options(self._target)
+        observation, _ = simulation.reset(given=simulation.episodes.given(options))
+        return observation
+
+    def _note(self, info: dict[str, Any]) -> None:
+        self._steps += 1
+        self._missed += int(info["missed_ticks"][0])
+        self._lateness = [*self._lateness[-999:], float(info["lateness"][0])]
+        self._error = float(info["distance"][0]) if "distance" in info else None
+
+    def _wait_for_resume(self, error: ArmStoppedError, end: float) -> None:
+        self._log(str(error))
+        self._status = f"stopped: {self.backend.driver.safety.reason}"
+        while not self._ended and time.monotonic() < end:
+            try:
+                self.backend.driver.check()
+                break
+            except ArmStoppedError:
+                time.sleep(_WAIT)
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """What the deployment reports now."""
+        link = self.backend.driver.link
+        late = np.array(self._lateness or [0.0])
+        state = link.state
+        return Diagnostics(
+            self._status,
+            self._steps,
+            self._missed,
+            (float(np.median(late)), float(np.quantile(late, 0.99))),
+            np.inf if state is None else time.monotonic() - state.received,
+            dict(link.refused),
+            self.backend.driver.timing,
+            self._error,
+        )
+
+    def close(self) -> None:
+        """Stop the arm, and end the connection."""
+        self._arms.close()
+
+
+def _as_options(target: Target) -> dict[str, Any]:
+    options: dict[str, Any] = {"target_position": list(target.position)}
+    if target.quaternion is not None:
+        options["target_quaternion"] = list(target.quaternion)
+    return options
