@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 
 from gym_mara.cli import FAILED, agents, environments, experiments, robots, training, viewing
 from gym_mara.cli.common import err, interruptible
+from gym_mara.cli.ros2 import app as ros2
 from gym_mara.errors import GymMaraError
 
 # Some versions of Typer have a copy of Click, so Click's own class is not always theirs.
@@ -44,6 +45,7 @@ app.command()(experiments.search)
 app.command()(robots.robot)
 app.command("list")(environments.list_)
 app.command()(environments.rewards)
+app.add_typer(ros2)
 
 
 def run(arguments: list[str]) -> int:

@@ -1,0 +1,72 @@
+"""gym-mara ros2 sim: a simulated arm in real time."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import Annotated, Any
+
+import typer
+
+from gym_mara.backends import make_backend
+from gym_mara.cli.common import backend_name, interruptible, keyword_arguments, number, out
+from gym_mara.cli.ros2.options import DomainOption, RobotOption
+from gym_mara.robot import RobotModel, RobotOptions
+
+
+def sim(
+    robot: RobotOption = "mara",
+    backend: Annotated[
+        str,
+        typer.Option(parser=backend_name, metavar="NAME", help="Backend; gym-mara list shows all."),
+    ] = "dart",
+    settings: Annotated[
+        list[str],
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Keyword argument of the backend or the robot, as JSON: --set max_joint_velocity=1.57.",
+        ),
+    ] = [],  # noqa: B006 - Typer reads it and never changes it
+    control_period: Annotated[
+        float,
+        typer.Option(
+            parser=number(0.001, 1.0),
+            metavar="X",
+            help="The time between two states, s; a command waits for the next one.",
+        ),
+    ] = 0.02,
+    clock: Annotated[
+        bool, typer.Option("--clock", help="Publish the simulated time on /clock.")
+    ] = False,
+    domain: DomainOption = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            parser=number(0.1, 1e9), metavar="X", help="For how long, s; by default without end."
+        ),
+    ] = None,
+) -> None:
+    """Simulate an arm in real time, behind the topics of ros2_control, for any program of ROS 2.
+
+    It publishes /joint_states, /robot_description and ~/contacts, follows commands on the topics of a
+    joint_trajectory_controller, of a forward_position_controller and of gym-gazebo2's MARA, and has the service ~/reset. Needs
+    the extra ros2.
+    """
+    from gym_mara.ros2.sim import SimNode
+    from gym_mara.ros2.simulated_arm import SimulatedArm
+
+    options = keyword_arguments(settings)
+    of_robot: dict[str, Any] = {
+        name: options.pop(name) for name in vars(RobotOptions()) if name in options
+    }
+    if "ee_frame" in options:
+        of_robot["ee_frame"] = options.pop("ee_frame")
+    options.setdefault("control_period", control_period)
+    model = RobotModel.load(robot, **of_robot)
+    with interruptible("Stopped."), closing(make_backend(backend, model, 1, options)) as engine:
+        with closing(SimNode(SimulatedArm(engine), clock=clock, domain=domain)) as node:
+            out.print(f"ready: {node.summary}", soft_wrap=True, highlight=False)
+            out.file.flush()
+            node.run(seconds)
+        if node.pace.missed:
+            out.print(f"{node.pace.missed} ticks were missed", soft_wrap=True, highlight=False)

@@ -1,0 +1,64 @@
+"""Who publishes and who subscribes to a topic, and whether they fit together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from gym_mara.ros2.node import needs_ros
+
+with needs_ros("ROS 2"):
+    from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+
+
+class Endpoint(NamedTuple):
+    """A publisher or a subscriber."""
+
+    node: str
+    """The full name of its node."""
+    type: str
+    """The type of its messages, such as "sensor_msgs/msg/JointState"."""
+    qos: Any
+
+
+def publishers(node: Any, topic: str) -> list[Endpoint]:
+    """The publishers of a topic, those of the node itself among them."""
+    return [_endpoint(info) for info in node.get_publishers_info_by_topic(topic)]
+
+
+def subscribers(node: Any, topic: str) -> list[Endpoint]:
+    """The subscribers of a topic, those of the node itself among them."""
+    return [_endpoint(info) for info in node.get_subscriptions_info_by_topic(topic)]
+
+
+def _endpoint(info: Any) -> Endpoint:
+    name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+    return Endpoint(name, info.topic_type, info.qos_profile)
+
+
+def others(endpoints: Sequence[Endpoint], node: Any, own: int) -> list[Endpoint]:
+    """The endpoints without a number of those of the node itself, of which another node may have the name."""
+    left = []
+    for endpoint in endpoints:
+        if own and endpoint.node == node.get_fully_qualified_name():
+            own -= 1
+        else:
+            left.append(endpoint)
+    return left
+
+
+def names(endpoints: Sequence[Endpoint]) -> str:
+    """The nodes of endpoints, for messages."""
+    return ", ".join(sorted(endpoint.node for endpoint in endpoints))
+
+
+def type_name(message: Any) -> str:
+    """The name of a message's type as the graph has it."""
+    package = message.__module__.split(".")[0]
+    return f"{package}/msg/{message.__name__}"
+
+
+def qos_problem(publisher: QoSProfile, subscriber: QoSProfile) -> str | None:
+    """Why nothing arrives from a publisher at a subscriber; None if it does."""
+    compatibility, reason = qos_check_compatible(publisher, subscriber)
+    return reason.strip() if compatibility == QoSCompatibility.ERROR else None
