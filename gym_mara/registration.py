@@ -71,8 +71,8 @@ def register_environments() -> None:
     for name, task in list(TASKS.items()):
         register_task(name, task)
     _register("MARAGoal-v0", Environment("MARARandomTarget-v0", 50, goals=True), {})
-    real = {"task": "MARA-v0", "backend": "ros2"}
-    _register("MARAReal-v0", Environment(max_episode_steps=MAX_EPISODE_STEPS, **real), real)
+    real = Environment("MARA-v0", MAX_EPISODE_STEPS, backend="ros2")
+    _register("MARAReal-v0", real, {"task": "MARA-v0", "backend": "ros2"})
 
 
 def environment_id(name: str) -> str:

@@ -93,12 +93,14 @@ class Ros2Backend(Backend):
         watchdogs = Watchdogs(command_age=command_age, tracking_error=tracking_error)
         safety = SafetyFilter(robot, period, limits, watchdogs, make_checker(collision, robot))
         live = flag("live", live)
-        link, self._clock = self._connect(
+        link, clock = self._connect(
             profile, controller=controller, namespace=namespace, domain=domain
         )
-        self.driver = Driver(link, safety, self._clock, live=live)
+        self.clock: Clock = clock
+        """Sets the pace."""
+        self.driver = Driver(link, safety, self.clock, live=live)
         """Moves the arm."""
-        self._began = self._due = self._clock.now()
+        self._began = self._due = self.clock.now()
         self._lateness = self._missed = 0.0
         self._collided = False
         try:
@@ -128,7 +130,7 @@ class Ros2Backend(Backend):
         self.driver.check()
         if self.driver.live:
             self._move_to(q[0])
-        self._began = self._due = self._clock.now()
+        self._began = self._due = self.clock.now()
         self._lateness = self._missed = 0.0
 
     def _move_to(self, goal: Floats) -> None:
@@ -151,9 +153,9 @@ class Ros2Backend(Backend):
                 self.driver.safety.speed = 1.0
 
     def _wait_at(self, goal: Floats) -> None:
-        end = self._clock.now() + _RESET_TIME
+        end = self.clock.now() + _RESET_TIME
         while not self._rests_at(goal):
-            if self._clock.now() > end:
+            if self.clock.now() > end:
                 off = np.abs(self._reported().q - goal)
                 joint = int(off.argmax())
                 raise GymMaraError(
@@ -161,7 +163,7 @@ class Ros2Backend(Backend):
                     f"{off[joint]:.3g} rad (m) away; is its controller active, and does it follow?"
                 )
             self.driver.command(goal)
-            self._clock.sleep_until(self._clock.now() + self.control_period)
+            self.clock.sleep_until(self.clock.now() + self.control_period)
 
     def _rests_at(self, goal: Floats) -> bool:
         state = self._reported()
@@ -169,12 +171,12 @@ class Ros2Backend(Backend):
         return bool(near.all() and still.all())
 
     def step(self, q_target: Floats) -> SimState:
-        late = self._clock.now() - self._due
+        late = self.clock.now() - self._due
         self._lateness, self._missed = max(0.0, late), float(max(0.0, late // self.control_period))
         self._due += (self._missed + 1.0) * self.control_period
         try:
             self.driver.command(q_target[0])
-            self._clock.sleep_until(self._due)
+            self.clock.sleep_until(self._due)
             self.driver.check()
         except ArmStoppedError:
             if not self.driver.safety.blocked:
@@ -193,7 +195,7 @@ class Ros2Backend(Backend):
         q = reported.q[None].copy()
         qd = np.clip(reported.qd, -self.joint_velocity, self.joint_velocity)[None]
         position, quaternion = self._kinematics.pose(q)
-        now = self._clock.now()
+        now = self.clock.now()
         timing = {
             "lateness": self._lateness,
             "missed_ticks": self._missed,

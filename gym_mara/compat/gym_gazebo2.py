@@ -131,11 +131,15 @@ def _jacobian_times_position(kinematics: Kinematics, state: SimState, goal: Goal
     return kinematics.velocity(state.q, state.q)
 
 
-for _name in PAPER_TASKS:
+_ENVIRONMENTS: dict[str, dict[str, str]] = {
+    **{name: {"task": name} for name in PAPER_TASKS},
+    "MARAReal-v0": {"task": "MARA-v0", "backend": "ros2", "profile": "mara-2019"},
+}
+for _name, _keywords in _ENVIRONMENTS.items():
     register(
         id=_name,
         entry_point="gym_mara.compat.gym_gazebo2:GazeboMaraEnv",
-        kwargs={"task": _name},
+        kwargs=_keywords,
         order_enforce=False,  # Gymnasium's wrappers would hide `set_episode_size`
         disable_env_checker=True,
     )

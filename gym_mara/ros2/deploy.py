@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -57,7 +56,10 @@ class Diagnostics(NamedTuple):
         late, ticks = self.lateness, self.setpoints
         refused = ", ".join(f"{reason} {count}" for reason, count in self.refused.items())
         return [
-            ("distance to the target, mm", "-" if self.error is None else f"{1e3 * self.error:.3f}"),
+            (
+                "distance to the target, mm",
+                "-" if self.error is None else f"{1e3 * self.error:.3f}",
+            ),
             ("actions", f"{self.steps:,}"),
             ("missed control periods", f"{self.missed_ticks:,}"),
             ("lateness of actions, p50 and p99, ms", f"{1e3 * late[0]:.2f}, {1e3 * late[1]:.2f}"),
@@ -100,6 +102,7 @@ class Deployment:
         self.simulation = simulation = self._arms.simulation
         assert isinstance(simulation.backend, Ros2Backend)
         self.backend: Ros2Backend = simulation.backend
+        self._clock = self.backend.clock
         simulation.streams = (Streams.of(np.random.default_rng(0)),)
         self.follows = simulation.task.random_goal
         """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
@@ -111,12 +114,24 @@ class Deployment:
         self._ended = False
         self._steps, self._missed = 0, 0
         self._lateness: list[float] = []
-        self._status, self._error = "waits for a target", None
+        self._status = "waits for a target"
+        self._error: float | None = None
         try:
             policy.check(self._arms)
+            # What takes long the first time does so before the arm moves.
+            self._act(self._begin())
+            if self.follows:
+                goal = simulation.goal
+                quaternion = tuple(goal.quaternion[0]) if self.oriented else None
+                self.check(Target(tuple(goal.position[0]), quaternion))
         except BaseException:
             self.close()
             raise
+
+    def _act(self, observation: Floats) -> Floats:
+        """The action (1, A) of the policy for an observation (1, O)."""
+        action, _ = self.policy.predict(self.simulation.present(observation))
+        return action
 
     @property
     def node(self) -> RosNode:
@@ -139,6 +154,14 @@ class Deployment:
             )
         with self._lock:
             self._asked = target
+
+    def check(self, target: Target) -> None:
+        """Check a target, before `run`.
+
+        Raises:
+            GymMaraError: it is out of reach, or reached only with a collision, or not of the form that the task takes.
+        """
+        self.simulation.episodes.given(_as_options(target))
 
     def stop(self, reason: str) -> None:
         """Decelerate to a hold until `resume`. It may be called from any thread."""
@@ -165,13 +188,19 @@ class Deployment:
         Raises:
             GymMaraError: the arm cannot be driven any more.
         """
-        end = np.inf if seconds is None else time.monotonic() + seconds
-        while not self._ended and time.monotonic() < end:
+        end = np.inf if seconds is None else self._clock.now() + seconds
+        while not self._over(end):
             if not self.follows or self._take_target(None):
                 self._episode(end)
             else:
                 self._status = "waits for a target"
-                time.sleep(_WAIT)
+                self._wait()
+
+    def _over(self, end: float) -> bool:
+        return self._ended or self._clock.now() >= end
+
+    def _wait(self) -> None:
+        self._clock.sleep_until(self._clock.now() + _WAIT)
 
     def _take_target(self, observation: Any) -> bool:
         """Whether there is a target; a new one is checked first, and the old one stays where it is refused."""
@@ -179,7 +208,7 @@ class Deployment:
             asked, self._asked = self._asked, None
         if asked is not None:
             try:
-                self.simulation.episodes.given(_as_options(asked))
+                self.check(asked)
             except GymMaraError as error:
                 self._log(f"the target {[*asked.position]} is refused: {error}")
             else:
@@ -195,11 +224,10 @@ class Deployment:
         try:
             observation = self._begin()
             self._status = "moves"
-            while not self._ended and time.monotonic() < end:
+            while not self._over(end):
                 if self.follows:
                     self._take_target(observation)
-                action, _ = self.policy.predict(simulation.present(observation))
-                outcome = simulation.step(action)
+                outcome = simulation.step(self._act(observation))
                 observation = outcome.observation
                 self._note(outcome.info)
                 self.backend.driver.check()
@@ -225,12 +253,12 @@ class Deployment:
     def _wait_for_resume(self, error: ArmStoppedError, end: float) -> None:
         self._log(str(error))
         self._status = f"stopped: {self.backend.driver.safety.reason}"
-        while not self._ended and time.monotonic() < end:
+        while not self._over(end):
             try:
                 self.backend.driver.check()
                 break
             except ArmStoppedError:
-                time.sleep(_WAIT)
+                self._wait()
 
     @property
     def diagnostics(self) -> Diagnostics:
@@ -243,7 +271,7 @@ class Deployment:
             self._steps,
             self._missed,
             (float(np.median(late)), float(np.quantile(late, 0.99))),
-            np.inf if state is None else time.monotonic() - state.received,
+            np.inf if state is None else self._clock.now() - state.received,
             dict(link.refused),
             self.backend.driver.timing,
             self._error,

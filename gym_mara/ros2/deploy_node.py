@@ -55,7 +55,9 @@ class DeployNode:
     def _aim(self, message: Any) -> None:
         try:
             frame = one_of("frame of a target", message.header.frame_id.lstrip("/"), self._frames)
-            self._deployment.aim(_target(message.pose, self._frames[frame], self._deployment.oriented))
+            self._deployment.aim(
+                _target(message.pose, self._frames[frame], self._deployment.oriented)
+            )
         except GymMaraError as error:
             self._log(str(error))
 

@@ -83,6 +83,7 @@ def deploy(
         try:
             DeployNode(deployment, deployment.node, _note)
             if first is not None:
+                deployment.check(first)
                 deployment.aim(first)
             out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
             if not live:

@@ -1,0 +1,190 @@
+"""The backend "ros2" with an arm without ROS and a clock that the test moves."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from gym_mara.backends import backend_names, make_backend, simulated_backends
+from gym_mara.errors import GymMaraError
+from gym_mara.robot import RobotModel
+from gym_mara.ros2.driver import ArmStoppedError
+from tests.helpers import PATH_ENDS
+from tests.ros2.fake import FakeRos2Backend
+
+Make = Callable[..., FakeRos2Backend]
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return RobotModel.load("mara")
+
+
+@pytest.fixture
+def make(robot: RobotModel) -> Make:
+    def made(**settings: Any) -> FakeRos2Backend:
+        backend = FakeRos2Backend(robot, 1, **{"live": True, **settings})
+        backend.reset(backend.state.q)
+        return backend
+
+    return made
+
+
+def _steps(backend: FakeRos2Backend, count: int) -> None:
+    for _ in range(count):
+        backend.step(backend.arm.q[None] + 0.3)
+
+
+def test_a_step_moves_the_arm_towards_the_target_for_a_control_period(make: Make) -> None:
+    backend = make()
+    target = backend.state.q + 0.1
+    before = backend.clock.now()
+    states = [backend.step(target) for _ in range(100)]
+    assert backend.clock.now() - before == pytest.approx(100 * backend.control_period)
+    np.testing.assert_allclose(states[-1].q, target, atol=1e-9)
+    assert states[-1].time == pytest.approx(2.0)
+    moved = [float(state.q[0, 0]) for state in states]
+    assert all(a <= b for a, b in itertools.pairwise(moved))
+
+
+def test_the_state_is_that_of_the_arm(make: Make, robot: RobotModel) -> None:
+    backend = make()
+    state = backend.step(backend.state.q + 0.05)
+    np.testing.assert_array_equal(state.q[0], backend.arm.q)
+    position, quaternion = robot.kinematics().pose(state.q)
+    np.testing.assert_array_equal(state.ee_position, position)
+    np.testing.assert_array_equal(state.ee_quaternion, quaternion)
+    assert not state.collided[0]
+    assert set(state.timing or {}) == {"lateness", "missed_ticks", "state_age"}
+
+
+def test_late_actions_are_reported_and_missed_periods_are_left_out(make: Make) -> None:
+    backend = make(command_age=10.0)
+    backend.step(backend.state.q)
+    backend.clock.pass_by(0.005)
+    timing = backend.step(backend.state.q).timing
+    assert timing is not None
+    assert timing["lateness"][0] == pytest.approx(0.005)
+    assert timing["missed_ticks"][0] == 0
+    backend.clock.pass_by(0.05)
+    before = backend.clock.now()
+    timing = backend.step(backend.state.q).timing
+    assert timing is not None
+    assert timing["missed_ticks"][0] == 2
+    assert backend.clock.now() - before <= backend.control_period + 1e-9
+
+
+def test_reset_moves_slowly_to_the_start_pose_and_ends_at_rest(make: Make) -> None:
+    backend = make()
+    start = backend.state.q + 0.5
+    backend.reset(start)
+    state = backend.state
+    np.testing.assert_allclose(state.q, start, atol=0.011)
+    assert np.abs(state.qd).max() < 0.06
+    speeds = np.array([s.qd for s in backend.arm.sent])
+    assert (np.abs(speeds) <= 0.25 * backend.joint_velocity + 1e-6).all()
+    assert state.time[0] == 0.0
+
+
+def test_reset_refuses_a_start_pose_behind_an_obstacle(robot: RobotModel) -> None:
+    class There(FakeRos2Backend):
+        start_q = np.array(PATH_ENDS[0])
+
+    backend = There(robot, 1, live=True)
+    sent = len(backend.arm.sent)
+    with pytest.raises(GymMaraError, match=r"straight joint move from .* collides"):
+        backend.reset(np.array([PATH_ENDS[1]]))
+    assert len(backend.arm.sent) == sent, "nothing moves"
+
+
+def test_a_collision_ahead_stops_the_arm_and_the_next_reset_resumes_it(robot: RobotModel) -> None:
+    class There(FakeRos2Backend):
+        start_q = np.array(PATH_ENDS[0])
+
+    backend = There(robot, 1, live=True)
+    backend.reset(backend.state.q)
+    state = backend.state
+    for _ in range(1000):
+        state = backend.step(np.array([PATH_ENDS[1]]))
+        if state.collided[0]:
+            break
+    assert state.collided[0]
+    assert not backend._checker.check(backend.state.q)[0], "it stops before the obstacle"
+    backend.clock.pass_by(1.0)
+    backend.reset(backend.state.q)
+    assert not backend.state.collided[0]
+    backend.step(np.array([PATH_ENDS[0]]))
+
+
+def test_an_arm_that_falls_silent_stops_and_steps_say_why_until_it_is_resumed(make: Make) -> None:
+    backend = make()
+    backend.arm.silent_since = backend.clock.now()
+    with pytest.raises(ArmStoppedError, match=r"state is .* old.*resume"):
+        _steps(backend, 20)
+    with pytest.raises(ArmStoppedError):
+        backend.reset(backend.state.q)
+    backend.arm.silent_since = None
+    backend.clock.pass_by(1.0)
+    backend.driver.resume()
+    backend.reset(backend.state.q)
+    backend.step(backend.state.q)
+
+
+def test_an_arm_that_does_not_follow_stops(make: Make) -> None:
+    backend = make()
+    backend.arm.follows = False
+    with pytest.raises(ArmStoppedError, match="does not follow"):
+        _steps(backend, 100)
+
+
+def test_a_learner_that_pauses_leaves_the_arm_at_rest_at_its_last_target(make: Make) -> None:
+    backend = make(command_age=2.0)
+    target = backend.state.q + 0.1
+    backend.step(target)
+    backend.clock.pass_by(30.0)
+    state = backend.step(target)
+    np.testing.assert_allclose(state.q, target, atol=1e-9)
+
+
+def test_without_live_nothing_is_sent_and_the_arm_stays(make: Make) -> None:
+    backend = make(live=False)
+    q = backend.state.q
+    backend.reset(q + 0.5)
+    for _ in range(50):
+        state = backend.step(q + 0.5)
+    assert not backend.arm.sent
+    np.testing.assert_array_equal(state.q, q)
+    planned = backend.driver.setpoint
+    assert planned is not None
+    assert np.abs(planned.q - q[0]).max() > 0.1, "what would be sent"
+
+
+def test_it_cannot_be_saved_restored_or_copied(make: Make) -> None:
+    backend = make()
+    with pytest.raises(GymMaraError, match="real arm"):
+        backend.save()
+    with pytest.raises(GymMaraError, match="real arm"):
+        backend.restore({})
+    with pytest.raises(GymMaraError, match="real arm"):
+        copy.deepcopy(backend)
+
+
+def test_it_moves_one_arm(robot: RobotModel) -> None:
+    with pytest.raises(GymMaraError, match="num_envs must be at most 1"):
+        make_backend("ros2", robot, 2, {})
+
+
+def test_it_is_a_backend_but_no_simulated_one() -> None:
+    assert "ros2" in backend_names()
+    assert "ros2" not in simulated_backends()
+
+
+def test_the_id_of_a_real_arm_has_this_backend() -> None:
+    spec = gymnasium.spec("gym_mara/MARAReal-v0")
+    assert spec.kwargs == {"task": "MARA-v0", "backend": "ros2"}

@@ -1,0 +1,156 @@
+"""A policy on an arm without ROS, with a clock that the test moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gym_mara.backends import registry
+from gym_mara.deploy import OnnxPolicy
+from gym_mara.errors import GymMaraError
+from gym_mara.pretrained import pretrained_file
+from gym_mara.ros2.deploy import Deployment, Target
+from tests.ros2.fake import FakeArm, FakeClock
+
+NEAR, OTHER = Target((-0.4, 0.095, 0.87)), Target((-0.3, 0.4, 0.9))
+AWAY = Target((5.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def policy() -> OnnxPolicy:
+    return OnnxPolicy(pretrained_file("MARAReach-v0"))
+
+
+@pytest.fixture
+def deploy(
+    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Deployment]]:
+    monkeypatch.setitem(registry._BACKENDS, "ros2", "tests.ros2.fake:FakeRos2Backend")
+    made = []
+
+    def make(log: Callable[[str], None] = print, **options: Any) -> Deployment:
+        made.append(Deployment(policy, None, {"live": True, **options}, log))
+        return made[-1]
+
+    yield make
+    for deployment in made:
+        deployment.close()
+
+
+def _arm(deployment: Deployment) -> FakeArm:
+    arm = deployment.backend.driver.link
+    assert isinstance(arm, FakeArm)
+    return arm
+
+
+def _clock(deployment: Deployment) -> FakeClock:
+    clock = deployment.backend.clock
+    assert isinstance(clock, FakeClock)
+    return clock
+
+
+def _error(deployment: Deployment, target: Target) -> float:
+    """The tool's distance to a target, m."""
+    return float(np.linalg.norm(deployment.backend.state.ee_position - target.position))
+
+
+def test_it_reaches_a_target_and_follows_the_next_one(deploy: Callable[..., Deployment]) -> None:
+    deployment = deploy()
+    for target in (NEAR, OTHER, NEAR):
+        deployment.aim(target)
+        deployment.run(8.0)
+        assert _error(deployment, target) < 1e-4
+        assert deployment.diagnostics.error == pytest.approx(_error(deployment, target), abs=1e-6)
+    assert deployment.diagnostics.status == "moves"
+
+
+def test_without_a_target_the_arm_rests(deploy: Callable[..., Deployment]) -> None:
+    deployment = deploy()
+    q = _arm(deployment).q.copy()
+    deployment.run(3.0)
+    np.testing.assert_array_equal(_arm(deployment).q, q)
+    assert deployment.diagnostics.status == "waits for a target"
+
+
+def test_a_target_out_of_reach_is_refused_and_the_last_one_stays(
+    deploy: Callable[..., Deployment],
+) -> None:
+    notes: list[str] = []
+    deployment = deploy(notes.append)
+    q = _arm(deployment).q.copy()
+    with pytest.raises(GymMaraError, match="reach"):
+        deployment.check(AWAY)
+    deployment.aim(AWAY)
+    deployment.run(2.0)
+    np.testing.assert_array_equal(_arm(deployment).q, q)
+    assert "refused" in notes[0]
+    deployment.aim(NEAR)
+    deployment.run(6.0)
+    deployment.aim(AWAY)
+    deployment.run(1.0)
+    assert _error(deployment, NEAR) < 1e-4
+    assert len(notes) == 2
+
+
+def test_a_stop_is_latched_until_the_operator_resumes(deploy: Callable[..., Deployment]) -> None:
+    notes: list[str] = []
+    deployment = deploy(notes.append)
+    deployment.aim(NEAR)
+    deployment.run(0.7)
+    deployment.stop("somebody asked")
+    deployment.run(2.0)
+    stopped = _arm(deployment).q.copy()
+    assert deployment.diagnostics.status == "stopped: somebody asked"
+    deployment.run(5.0)
+    np.testing.assert_array_equal(_arm(deployment).q, stopped)
+    assert _error(deployment, NEAR) > 0.01
+    deployment.resume()
+    deployment.run(8.0)
+    assert _error(deployment, NEAR) < 1e-4
+    assert "somebody asked" in notes[0]
+
+
+def test_an_arm_that_falls_silent_stops_where_it_is(deploy: Callable[..., Deployment]) -> None:
+    deployment = deploy()
+    deployment.aim(NEAR)
+    deployment.run(0.7)
+    arm = _arm(deployment)
+    arm.silent_since = _clock(deployment).now()
+    deployment.run(2.0)
+    assert "old" in deployment.diagnostics.status
+    with pytest.raises(GymMaraError, match="old"):
+        deployment.resume()
+    arm.silent_since = None
+    deployment.resume()
+    deployment.run(8.0)
+    assert _error(deployment, NEAR) < 1e-4
+
+
+def test_without_live_nothing_is_sent(deploy: Callable[..., Deployment]) -> None:
+    deployment = deploy(live=False)
+    deployment.aim(NEAR)
+    deployment.run(2.0)
+    assert not _arm(deployment).sent
+
+
+def test_an_end_is_an_end(deploy: Callable[..., Deployment]) -> None:
+    deployment = deploy()
+    deployment.end()
+    deployment.run()
+
+
+def test_a_policy_of_another_robot_is_refused(deploy: Callable[..., Deployment]) -> None:
+    with pytest.raises(GymMaraError, match=r"another|moves the joints"):
+        deploy(robot="ur5")
+
+
+def test_a_policy_with_a_target_of_its_own_takes_no_other(
+    deploy: Callable[..., Deployment],
+) -> None:
+    deployment = deploy()
+    deployment.follows = False
+    with pytest.raises(GymMaraError, match="own"):
+        deployment.aim(NEAR)
