@@ -22,6 +22,8 @@ from gym_mara.ros2.paths import PathChecker
 from gym_mara.ros2.watchdogs import Guard, Watchdogs, too_old, wrong_clock
 from gym_mara.types import Floats
 
+__all__ = ["NO_EMERGENCY_STOP", "Mode", "SafetyFilter", "Watchdogs"]
+
 NO_EMERGENCY_STOP = "the safety filter replaces no emergency stop: keep one within reach, and nobody within the arm's reach"
 """What a program says before it moves an arm."""
 RAMP_TIME = 1.0
