@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
 import platform
@@ -137,6 +138,8 @@ class RosNode:
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._spin, name=f"ros {name}", daemon=True)
         self._thread.start()
+        # A thread that still waits in ROS when the process ends would abort it.
+        atexit.register(self.close)
 
     def now(self) -> float:
         """The time of the machine as stamps have it, s."""
@@ -166,6 +169,7 @@ class RosNode:
         if self._ending.is_set():
             return
         self._ending.set()
+        atexit.unregister(self.close)
         self._executor.wake()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
