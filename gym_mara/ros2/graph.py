@@ -55,6 +55,15 @@ def names(endpoints: Sequence[Endpoint]) -> str:
     return ", ".join(sorted(endpoint.node for endpoint in endpoints))
 
 
+def described(endpoints: Sequence[Endpoint]) -> str:
+    """The nodes of endpoints with their qualities of service, for messages."""
+    texts = []
+    for endpoint in sorted(endpoints, key=lambda each: each.node):
+        qualities = endpoint.qos.reliability.name, endpoint.qos.durability.name
+        texts.append(f"{endpoint.node} ({', '.join(qualities).lower().replace('_', ' ')})")
+    return ", ".join(texts)
+
+
 def type_name(message: Any) -> str:
     """The name of a message's type as the graph has it."""
     package = message.__module__.split(".")[0]

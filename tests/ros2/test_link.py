@@ -110,7 +110,7 @@ def test_an_exception_in_a_callback_is_a_refusal_and_ends_nothing(
     link, arm = links(mara), Arm(peer)
     eventually(lambda: arm.publish() and link.state)
     with monkeypatch.context() as patched:
-        patched.setattr(link, "_parse", lambda message: 1 / 0)
+        patched.setattr(link, "parse", lambda message: 1 / 0)
         eventually(lambda: arm.publish() and link.refused.get(UNREADABLE, 0) >= 2)
     arm.publish(position=[0.0] * 6)
     eventually(lambda: link.state is not None and not link.state.q.any())
@@ -122,7 +122,7 @@ def test_trajectories_are_sent(
 ) -> None:
     link = links(mara, name)
     heard = peer.heard(JointTrajectory, link.profile.command_topic, link._qos)
-    eventually(lambda: not link._command_problems())
+    eventually(lambda: not link.command_problems())
     link.send(SETPOINT, 0.02)
     (message,) = eventually(lambda: heard)
     (point,) = message.points
@@ -138,7 +138,7 @@ def test_trajectories_are_sent(
 def test_positions_are_sent(links: Callable[..., RosLink], peer: Peer, mara: RobotModel) -> None:
     link = links(mara, "forward", namespace="left")
     heard = peer.heard(Float64MultiArray, "/left/forward_position_controller/commands")
-    eventually(lambda: not link._command_problems())
+    eventually(lambda: not link.command_problems())
     link.send(SETPOINT, 0.02)
     (message,) = eventually(lambda: heard)
     assert message.data.tolist() == Q
@@ -149,7 +149,7 @@ def test_what_is_not_finite_is_never_sent(
 ) -> None:
     link = links(mara)
     heard = peer.heard(JointTrajectory, COMMANDS)
-    eventually(lambda: not link._command_problems())
+    eventually(lambda: not link.command_problems())
     for bad in (math.nan, math.inf):
         wrong = np.array([*Q[:5], bad])
         for setpoint in (SETPOINT._replace(q=wrong), SETPOINT._replace(qd=wrong)):

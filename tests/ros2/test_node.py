@@ -66,9 +66,12 @@ def test_a_callback_that_does_not_end_does_not_hold_the_end(ros_domain: int) -> 
     node, peer, ending = RosNode("hangs"), Peer(), threading.Event()
     try:
         entered = threading.Event()
-        node.node.create_subscription(
-            String, "/words", lambda _: (entered.set(), ending.wait(10.0)), 10
-        )
+
+        def hang(_: String) -> None:
+            entered.set()
+            ending.wait(10.0)
+
+        node.node.create_subscription(String, "/words", hang, 10)
         words = peer.publisher(String, "/words")
         eventually(lambda: words.publish(String()) or entered.is_set())
         before = time.monotonic()

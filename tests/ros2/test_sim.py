@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,14 @@ def is_at(node: SimNode, goal: Any) -> Callable[[], bool]:
     return lambda: bool(np.allclose(node.arm.state.q[0], goal, atol=2e-3))
 
 
+def is_reported(link: RosLink, goal: Any) -> Callable[[], bool]:
+    return lambda: link.state is not None and bool(np.allclose(link.state.q, goal, atol=2e-3))
+
+
+def _refused(node: SimNode, count: int) -> bool:
+    return node.refused == count
+
+
 def trajectory(goal: Any, seconds: float = 0.2, names: list[str] = NAMES) -> Any:
     return messages.trajectory(names, np.asarray(goal, np.float64), None, seconds)
 
@@ -130,7 +139,7 @@ def test_bad_commands_are_refused_and_logged(
     ):
         before = node.refused
         send(publisher, message)
-        eventually(lambda before=before: node.refused == before + 1)
+        eventually(partial(_refused, node, before + 1))
     assert is_at(node, mara.home)()
     assert "refused: " in capfd.readouterr().err
 
@@ -208,7 +217,7 @@ def test_a_link_moves_it(node: SimNode, mara: RobotModel) -> None:
             goal = mara.home + 0.05 * number
             zeros = np.zeros(6)
             link.send(Setpoint(goal, zeros, zeros), 0.02)
-            eventually(lambda link=link, goal=goal: np.allclose(link.state.q, goal, atol=2e-3))
+            eventually(is_reported(link, goal))
             assert not link.refused
         finally:
             link.close()
