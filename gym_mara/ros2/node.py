@@ -97,8 +97,8 @@ with needs_ros("ROS 2"), warnings.catch_warnings():
     except Exception as error:
         raise ImportError(str(error), name="sensor_msgs") from error
 
-_WAKE_UP = 0.2
-"""How often the thread looks whether it is to end, s."""
+_WAKE_UP = 1.0
+"""How often the thread looks whether the context has ended, s."""
 
 
 class RosNode:
@@ -136,6 +136,7 @@ class RosNode:
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._ending = threading.Event()
+        self._wake = self.node.create_guard_condition(lambda: None)
         self._thread = threading.Thread(target=self._spin, name=f"ros {name}", daemon=True)
         self._thread.start()
         # A thread that still waits in ROS when the process ends would abort it.
@@ -170,7 +171,7 @@ class RosNode:
             return
         self._ending.set()
         atexit.unregister(self.close)
-        self._executor.wake()
+        self._wake.trigger()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
             if self._thread.is_alive():

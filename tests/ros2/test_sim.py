@@ -107,12 +107,12 @@ def test_it_reports_the_arm(node: SimNode, peer: Peer, mara: RobotModel) -> None
 
 
 def test_it_obeys_all_forms_of_commands(node: SimNode, peer: Peer, mara: RobotModel) -> None:
-    commands = [
+    commands: list[tuple[Any, Callable[[Any], Any]]] = [
         (peer.publisher(JointTrajectory, sim.TRAJECTORY), trajectory),
         (peer.publisher(JointTrajectory, sim.MARA_2019, messages.SENSOR_DATA), trajectory),
         (
             peer.publisher(Float64MultiArray, sim.FORWARD),
-            lambda goal: messages.positions(np.asarray(goal)),
+            messages.positions,
         ),
     ]
     for number, (publisher, message) in enumerate(commands, start=1):
@@ -198,6 +198,7 @@ def test_contacts_are_published_and_their_end(
         eventually(lambda: not heard[-1].status)
 
 
+@pytest.mark.slow
 def test_an_engine_without_contacts_reports_that_links_touch(
     node: SimNode, peer: Peer, mara: RobotModel
 ) -> None:
@@ -208,6 +209,7 @@ def test_an_engine_without_contacts_reports_that_links_touch(
     eventually(lambda: heard and heard[-1].status and heard[-1].status[0].message == "links touch")
 
 
+@pytest.mark.slow
 def test_a_link_moves_it(node: SimNode, mara: RobotModel) -> None:
     """The two halves of the package speak to each other, in every form that needs no control_msgs."""
     for number, profile in enumerate(("trajectory", "forward", "mara-2019"), start=1):
