@@ -8,7 +8,10 @@ from typing import Any, NamedTuple
 from gym_mara.ros2.node import needs_ros
 
 with needs_ros("ROS 2"):
-    from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+VOLATILE, TRANSIENT_LOCAL = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
 
 
 class Endpoint(NamedTuple):
@@ -52,13 +55,28 @@ def names(endpoints: Sequence[Endpoint]) -> str:
     return ", ".join(sorted(endpoint.node for endpoint in endpoints))
 
 
+def described(endpoints: Sequence[Endpoint]) -> str:
+    """The nodes of endpoints with their qualities of service, for messages."""
+    texts = []
+    for endpoint in sorted(endpoints, key=lambda each: each.node):
+        qualities = endpoint.qos.reliability.name, endpoint.qos.durability.name
+        texts.append(f"{endpoint.node} ({', '.join(qualities).lower().replace('_', ' ')})")
+    return ", ".join(texts)
+
+
 def type_name(message: Any) -> str:
     """The name of a message's type as the graph has it."""
     package = message.__module__.split(".")[0]
     return f"{package}/msg/{message.__name__}"
 
 
-def qos_problem(publisher: QoSProfile, subscriber: QoSProfile) -> str | None:
-    """Why nothing arrives from a publisher at a subscriber; None if it does."""
-    compatibility, reason = qos_check_compatible(publisher, subscriber)
-    return reason.strip() if compatibility == QoSCompatibility.ERROR else None
+def qos_problem(publisher: Any, subscriber: Any) -> str | None:
+    """Why nothing arrives from a publisher with this quality of service at a subscriber with that one; None if it does.
+
+    Deadlines and leases are not compared: an endpoint that was discovered has others than one that was made without.
+    """
+    if publisher.reliability == BEST_EFFORT and subscriber.reliability == RELIABLE:
+        return "the publisher is best effort, and the subscriber wants reliable"
+    if publisher.durability == VOLATILE and subscriber.durability == TRANSIENT_LOCAL:
+        return "the publisher is volatile, and the subscriber wants transient local"
+    return None

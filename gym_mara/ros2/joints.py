@@ -63,7 +63,7 @@ class JointMap:
         margin = np.where(robot.kinematics().prismatic, LIMIT_MARGIN[1], LIMIT_MARGIN[0])
         self._lower, self._upper = robot.lower - margin, robot.upper + margin
         self._limits = robot.lower, robot.upper
-        self._names: list[str] = []
+        self._names: list[str] | None = None
         self._order: NDArray[np.intp] = np.zeros(0, np.intp)
         self._stamp = 0.0
         self._anchor: tuple[Floats, float, bool] | None = None
@@ -147,10 +147,8 @@ class JointMap:
         """The values of the robot's joints; None where there are none."""
         if len(values) == 0:
             return None
-        if len(values) != len(self._names):
-            raise _RefusedError(
-                LENGTHS, f"{len(self._names)} names and {len(values)} values of {what}"
-            )
+        if len(values) != (count := len(self._names or ())):
+            raise _RefusedError(LENGTHS, f"{count} names and {len(values)} values of {what}")
         own = np.asarray(values, np.float64)[self._order]
         if bool((np.abs(own) <= LARGEST).all()):
             return own

@@ -96,13 +96,15 @@ class RosLink:
 
     def _connect(self, commands: bool) -> None:
         node, profile = self.node.node, self.profile
-        if profile.states == "joint_states":
-            self._state_type, self._parse = JointState, messages.of_joint_state
-        else:
-            self._state_type = messages.controller_state_type()
-            self._parse = messages.of_controller_state
+        self.state_type: Any = JointState
+        """The type of the states' messages."""
+        self.parse = messages.of_joint_state
+        """Reads one."""
+        if profile.states == "controller_state":
+            self.state_type = messages.controller_state_type()
+            self.parse = messages.of_controller_state
         self._subscription = node.create_subscription(
-            self._state_type,
+            self.state_type,
             profile.state_topic,
             guarded(self._on_state, self._on_error),
             messages.SENSOR_DATA,
@@ -141,7 +143,7 @@ class RosLink:
 
     def _on_state(self, message: Any) -> None:
         received = time.monotonic()
-        joints = self._parse(message)
+        joints = self.parse(message)
         with self._lock:
             state = self._map.read(
                 joints.names,
@@ -210,9 +212,10 @@ class RosLink:
 
     def problems(self) -> list[str]:
         """What is wrong before motion, and what to do; empty if nothing is. Others take up to a second to be discovered."""
-        return [*self._state_problems(), *self._command_problems()]
+        return [*self.state_problems(), *self.command_problems()]
 
-    def _state_problems(self) -> list[str]:
+    def state_problems(self) -> list[str]:
+        """What is wrong with the states."""
         topic, node = self.profile.state_topic, self.node.node
         found = graph.publishers(node, topic)
         if not found:
@@ -220,7 +223,7 @@ class RosLink:
                 f"nobody publishes {topic}: start the arm's driver with its joint_state_broadcaster, and check the ROS domain "
                 f"({self.node.domain}) and the namespace"
             ]
-        wanted = graph.type_name(self._state_type)
+        wanted = graph.type_name(self.state_type)
         other = [endpoint for endpoint in found if endpoint.type != wanted]
         if len(other) == len(found):
             return [
@@ -239,7 +242,8 @@ class RosLink:
             return [f"the clock of the states of {topic} does not advance: {last}"]
         return [f"no state of {topic} can be used: {last}"]
 
-    def _command_problems(self) -> list[str]:
+    def command_problems(self) -> list[str]:
+        """What is wrong with the commands."""
         topic, node = self.profile.command_topic, self.node.node
         if self._client is not None:
             if self._client.server_is_ready():

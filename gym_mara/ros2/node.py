@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib.util
 import os
 import platform
@@ -96,8 +97,8 @@ with needs_ros("ROS 2"), warnings.catch_warnings():
     except Exception as error:
         raise ImportError(str(error), name="sensor_msgs") from error
 
-_WAKE_UP = 0.2
-"""How often the thread looks whether it is to end, s."""
+_WAKE_UP = 1.0
+"""How often the thread looks whether the context has ended, s."""
 
 
 class RosNode:
@@ -135,8 +136,11 @@ class RosNode:
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._ending = threading.Event()
+        self._wake = self.node.create_guard_condition(lambda: None)
         self._thread = threading.Thread(target=self._spin, name=f"ros {name}", daemon=True)
         self._thread.start()
+        # A thread that still waits in ROS when the process ends would abort it.
+        atexit.register(self.close)
 
     def now(self) -> float:
         """The time of the machine as stamps have it, s."""
@@ -166,7 +170,8 @@ class RosNode:
         if self._ending.is_set():
             return
         self._ending.set()
-        self._executor.wake()
+        atexit.unregister(self.close)
+        self._wake.trigger()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
             if self._thread.is_alive():

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import typer
 
-from gym_mara.cli.ros2 import deploy, sim
+from gym_mara.cli.ros2 import check, deploy, sim
 
 app = typer.Typer(
     name="ros2",
     help="Connect policies to an arm of ROS 2, simulated or real.",
     no_args_is_help=True,
 )
+app.command()(check.check)
 app.command()(deploy.deploy)
 app.command()(sim.sim)
-app.command()(deploy.deploy)

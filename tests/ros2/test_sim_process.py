@@ -1,0 +1,84 @@
+"""`gym-mara ros2 sim` as a process, commanded by a program that is not gym_mara's; and `gym-mara ros2 check` of it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from gym_mara.backends.randomisation import Randomisation
+from gym_mara.cli import INTERRUPTED
+from gym_mara.pretrained import pretrained_file
+from gym_mara.robot import RobotModel
+from tests.helpers import Cli, started
+
+pytestmark = pytest.mark.slow
+PEER = Path(__file__).with_name("plain_peer.py")
+
+
+@contextmanager
+def simulation(*options: str) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process that is ready."""
+    with started("-m", "gym_mara.cli", "ros2", "sim", *options) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        yield process
+
+
+def peer(form: str, offset: float = 0.1) -> str:
+    """What the other program prints."""
+    arguments = [sys.executable, str(PEER), form, str(offset)]
+    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=40)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout.strip()
+
+
+@pytest.mark.parametrize("backend", ["dart", "mujoco"])
+def test_another_program_commands_it_in_all_forms(backend: str, ros_domain: int) -> None:
+    with simulation("--backend", backend, "--seconds", "60"):
+        assert [peer(form) for form in ("trajectory", "forward", "mara-2019")] == ["there"] * 3
+        assert peer("bad") == "rests"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_when_it_is_interrupted(number: signal.Signals, ros_domain: int) -> None:
+    with simulation("--backend", "pinocchio", "--set", "servo_gain=10") as process:
+        process.send_signal(number)
+        assert process.wait(15.0) == INTERRUPTED
+
+
+def test_it_ends_after_its_time(ros_domain: int) -> None:
+    with simulation("--backend", "mujoco", "--clock", "--seconds", "0.5") as process:
+        assert process.wait(15.0) == 0
+
+
+def test_a_check_is_green_with_it_and_red_without(
+    gym_mara: Cli, mara: RobotModel, ros_domain: int, tmp_path: Path
+) -> None:
+    file, policy = tmp_path / "figures.json", pretrained_file("MARAReach-v0")
+    with simulation("--seconds", "60"):
+        code, printed, _ = gym_mara("ros2", "check", policy, "--json", file)
+        assert code == 0, printed
+        assert "wrong" not in printed
+        for profile in ("forward", "mara-2019"):
+            assert gym_mara("ros2", "check", "--profile", profile, "--seconds", "0.5")[0] == 0
+        figures = json.loads(file.read_text())
+        assert figures["ok"]
+        assert 40.0 < figures["rate"] < 60.0
+        low, high = figures["latency"]
+        assert 0.02 <= low <= high < 0.12
+        Randomisation({"latency": figures["latency"]}, mara)  # as it is
+        code, printed, _ = gym_mara("ros2", "check", "--controller", "other", "--seconds", "0.5")
+        assert code == 1
+        assert "nobody listens to /other/joint_trajectory" in " ".join(printed.split())
+    code, printed, _ = gym_mara("ros2", "check", "--seconds", "0.5", "--domain", 102)
+    assert code == 1
+    assert "nobody publishes /joint_states" in " ".join(printed.split())
