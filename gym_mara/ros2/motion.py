@@ -218,6 +218,7 @@ class Motion:
     def follow_stop(self) -> bool:
         """Move the set-point along its stop for a period; returns whether it rests there."""
         self._stop_time += self.period
+        self._planner = self._joints  # the set-point leaves the line
         duration = self._stop.duration
         ended = bool(self._stop_time >= duration)
         q, self.qd, self.qdd = self._stop.at_time(duration if ended else self._stop_time)

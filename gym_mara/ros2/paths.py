@@ -101,9 +101,8 @@ class PathChecker:
             fastest = [
                 abs(v) + 0.5 * a * a / j for v, a, j in zip(qd, qdd, motion.jerk, strict=True)
             ]
-            if (
-                begin < 0.0
-            ):  # nor is the way to there faster than the mean of its ends by more than this
+            if begin < 0.0:
+                # Nor is the way to the set-point faster than the mean of its ends by more than this.
                 gain = 0.5 * motion.period
                 fastest = [
                     max(f, 0.5 * (abs(v) + abs(w)) + gain * a)

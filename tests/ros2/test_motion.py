@@ -72,7 +72,7 @@ def _motion(robot: RobotModel, infinite: bool = False) -> Motion:
 
 @pytest.mark.parametrize("name", ["mara", "panda"])
 @pytest.mark.parametrize("infinite", [False, True])
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_every_stop_is_known_from_its_start_to_its_end(
     name: str, infinite: bool, seed: int
@@ -125,6 +125,25 @@ def test_a_stop_is_followed_to_its_end_and_no_further(mara: RobotModel) -> None:
     assert motion.qd == motion.qdd == [0.0] * 6
     assert motion.follow_stop()
     assert motion.q == end
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_stop_can_be_left_and_begun_again(mara: RobotModel, turns: bool) -> None:
+    motion, rng = _motion(mara), np.random.default_rng(4)
+    last = [motion.q, motion.qd, motion.qdd]
+    for _ in range(200):
+        if rng.random() < 0.3:
+            motion.follow_stop()
+        else:
+            target = rng.choice([-1.0, 1.0], 6) if turns else np.full(6, 1.5)
+            assert motion.propose(target.tolist(), 1.0)
+            motion.accept()
+        now = [motion.q, motion.qd, motion.qdd]
+        jerk = (np.array(now[2]) - last[2]) / PERIOD
+        assert (np.abs(jerk) <= np.array(motion.jerk) * (1.0 + 1e-6)).all()
+        mean = 0.5 * PERIOD * (np.array(now[1]) + last[1])
+        np.testing.assert_allclose(np.array(now[0]) - last[0], mean, rtol=0.0, atol=2e-5)
+        last = now
 
 
 def test_a_joint_without_limits_turns_on_and_on() -> None:

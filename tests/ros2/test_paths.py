@@ -36,8 +36,23 @@ class Counting(CollisionChecker):
         return counting
 
 
-def _motion(robot: RobotModel) -> Motion:
-    return Motion(MotionLimits.of(robot), robot.lower, robot.upper, PERIOD)
+class Wall(CollisionChecker):
+    """An engine that finds a collision where the first joint is within a range."""
+
+    def __init__(self, robot: RobotModel, low: float, high: float, margins: bool) -> None:
+        super().__init__(robot)
+        self._low, self._high, self._margins = low, high, margins
+
+    def check(self, q: Floats) -> Mask:
+        return np.asarray((q[:, 0] > self._low) & (q[:, 0] < self._high))
+
+    def with_margin(self, displacement: Floats) -> CollisionChecker | None:
+        d = displacement[0]
+        return Wall(self.robot, self._low - d, self._high + d, True) if self._margins else None
+
+
+def _motion(robot: RobotModel, period: float = PERIOD) -> Motion:
+    return Motion(MotionLimits.of(robot), robot.lower, robot.upper, period)
 
 
 def _path(motion: Motion, count: int) -> Floats:
@@ -54,7 +69,7 @@ def test_the_answer_is_that_of_many_checks(name: str, margins: bool) -> None:
     paths = PathChecker(robot, Counting(robot, margins), np.array(motion.velocity))
     free = FreePoses(robot)
     hits = 0
-    for move in range(6):
+    for move in range(6 if margins else 3):
         motion.rest_at(free._free_configuration(rng, exact).tolist())
         target = rng.uniform(robot.lower, robot.upper)
         while move % 2 and not exact.check(target[None])[0]:
@@ -70,7 +85,40 @@ def test_the_answer_is_that_of_many_checks(name: str, margins: bool) -> None:
                 hits += 1
                 break
             motion.accept()
-    assert hits >= 3
+    assert hits >= (3 if margins else 1)
+
+
+@pytest.mark.parametrize("margins", [True, False])
+@pytest.mark.parametrize("share", [0.01, 0.1, 1.0])
+@pytest.mark.parametrize("period", [0.002, 0.01, 0.1])
+def test_a_wall_ahead_is_seen_at_any_speed(
+    mara: RobotModel, margins: bool, share: float, period: float
+) -> None:
+    motion, place = _motion(mara, period), 0.01 + 0.5 * share**0.5
+    paths = PathChecker(mara, Wall(mara, place, 9.0, margins), np.array(motion.velocity))
+    motion.rest_at([0.0] * 6)
+    for _ in range(20_000):
+        motion.propose([1.0] * 6, share)
+        if paths.first_collision(motion) is not None:
+            break
+        motion.accept()
+        assert motion.q[0] <= place
+    while not motion.follow_stop():
+        assert motion.q[0] <= place
+    way = share * motion.velocity[0] * period
+    assert place - 1.5 * way - 0.002 <= motion.q[0] <= place
+
+
+@pytest.mark.parametrize("margins", [True, False])
+def test_a_wall_on_the_way_to_the_next_set_point_is_seen(mara: RobotModel, margins: bool) -> None:
+    motion = _motion(mara, 0.5)
+    paths = PathChecker(mara, Wall(mara, 0.05, 0.06, margins), np.array(motion.velocity))
+    motion.rest_at([0.0] * 6)
+    motion.propose([1.0] * 6, 1.0)
+    assert motion.proposed(0.0)[0][0] > 0.06, "the stop begins behind the wall"
+    found = paths.first_collision(motion)
+    assert found is not None
+    assert 0.05 < found[0] < 0.06
 
 
 def test_an_arm_that_moves_slowly_or_rests_needs_few_checks(mara: RobotModel) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Setpoint
 from gym_mara.ros2.motion import MotionLimits
 from gym_mara.ros2.safety import Mode, SafetyFilter
-from tests.helpers import robot_model
-from tests.ros2.test_safety import LONGEST_STOP, state_of
+from tests.helpers import Floats, robot_model
+from tests.ros2.arms import LONGEST_STOP, state_of
 
 EVENTS = (
     *("go", "near", "flip", "into") * 3,
@@ -24,6 +25,14 @@ EVENTS = (
     *("clock stands", "clock back", "stop", "speed", "resume"),
 )
 """What may happen. Most are targets, so that the arm moves."""
+
+
+@functools.cache
+def colliding(name: str) -> Floats:
+    """Some configurations of a robot that collide (K, J)."""
+    robot = robot_model(name)
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (1000, robot.num_joints))
+    return q[CoalChecker(robot).check(q)]
 
 
 class World:
@@ -36,8 +45,7 @@ class World:
         self.filter = SafetyFilter(robot, period, self.limits, checker=CoalChecker(robot))
         self.now, self.stopping = 0.0, 0
         self.command: Any = robot.home
-        random = self.rng.uniform(robot.lower, robot.upper, (200, robot.num_joints))
-        self.obstacles = random[CoalChecker(robot).check(random)]
+        self.obstacles = colliding(robot.name)
         self.last = Setpoint(robot.home, *np.zeros((2, robot.num_joints)))
         self.path = [robot.home]
         self.filter.start(state_of(robot.home, self.now), self.now)
@@ -131,23 +139,36 @@ class World:
         assert (np.abs(setpoint.q - before.q - speed * dt) <= most).all()
 
 
+SEEDS = st.integers(0, 2**32 - 1)
+SEQUENCES = st.lists(st.sampled_from(EVENTS), min_size=10, max_size=40)
+
+
 @pytest.mark.parametrize(("name", "period"), [("mara", 0.01), ("panda", 0.02), ("mara", 0.05)])
-@settings(max_examples=15)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    events=st.lists(st.sampled_from(EVENTS), min_size=10, max_size=40),
-)
+@settings(max_examples=8)
+@given(seed=SEEDS, events=SEQUENCES)
 def test_no_sequence_leaves_the_limits_or_collides(
     name: str, period: float, seed: int, events: list[str]
 ) -> None:
-    robot = robot_model(name)
-    world = World(robot, period, seed)
+    _live_through(World(robot_model(name), period, seed), events)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "period"), [("mara", 0.01), ("ur5", 0.01), ("panda", 0.002)])
+@settings(max_examples=30)
+@given(seed=SEEDS, events=SEQUENCES)
+def test_nor_do_many_sequences(name: str, period: float, seed: int, events: list[str]) -> None:
+    _live_through(World(robot_model(name), period, seed), events)
+
+
+def _live_through(world: World, events: list[str]) -> None:
+    """Let events happen and then a stop, and check that nothing collides, at the set-points or between them."""
     for event in events:
         world.event(event)
     world.filter.stop("the end")
-    for _ in range(int(LONGEST_STOP / period) + 1):
+    for _ in range(int(LONGEST_STOP / world.period) + 1):
         world.tick()
     assert world.filter.mode is Mode.STOPPED
     path = np.array(world.path)
-    between = 0.5 * (path[1:] + path[:-1])
-    assert not CoalChecker(robot).check(np.vstack([path, between])).any()
+    way = path[1:] - path[:-1]
+    between = [path[:-1] + part * way for part in (0.25, 0.5, 0.75)]
+    assert not CoalChecker(world.robot).check(np.vstack([path, *between])).any()

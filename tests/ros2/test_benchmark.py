@@ -1,0 +1,23 @@
+"""The benchmark of the ROS 2 part runs; its figures mean nothing here."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "ros2.py"
+
+
+def test_the_filter_is_measured_with_and_without_collision_checks() -> None:
+    command = [sys.executable, str(SCRIPT), "--seconds", "1"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    for name in ("kinematic checks", "with the collision checks"):
+        line = rf"^filter: p50 \d+ µs, p99 \d+ µs, {name} \("
+        assert len(re.findall(line, done.stdout, re.MULTILINE)) == 2
