@@ -56,8 +56,8 @@ class SafetyFilter:
 
     From each set-point a stop that keeps the limits of acceleration and jerk is known. It stays within the joint limits, and neither
     it nor the way to the set-point collides. A set-point without one is refused: the arm follows the last stop, and the stop is
-    latched. So are a command that is no J finite numbers, a command or a state that is too old, an arm that does not follow its
-    set-points, and a clock that does not advance. A target beyond the joint limits is cut to them. Commands take effect only after
+    latched. So are a command that is no J finite numbers, a state that is too old, a command that is too old while the arm moves, an
+    arm that does not follow its set-points, and a clock that does not advance. A target beyond the joint limits is cut to them. Commands take effect only after
     `start`; after a stop only after `resume`.
 
     It replaces no emergency stop. Its methods may be called from any thread.
@@ -96,7 +96,7 @@ class SafetyFilter:
                 f"the motion limits are of {len(limits.velocity)} joints, and {robot.name} has {robot.num_joints}: make "
                 "them with MotionLimits.of(robot)"
             )
-        self.mode, self.reason = Mode.WAITING, None
+        self.mode, self.reason, self.blocked = Mode.WAITING, None, False
         self.clipped = 0
         self._speed = 1.0
         self._motion = Motion(limits, robot.lower, robot.upper, self.period)
@@ -110,6 +110,8 @@ class SafetyFilter:
     """What it does."""
     reason: str | None
     """Why it stops or stopped; None while it does not."""
+    blocked: bool
+    """Whether it stops or stopped because of a collision ahead: nothing is wrong with the arm then."""
     clipped: int
     """How many commands were cut to the joint limits."""
 
@@ -204,8 +206,9 @@ class SafetyFilter:
         if self.mode is not Mode.STOPPING:
             try:
                 trouble = wrong_clock(before, now)
-                trouble = trouble or self._guard.wrong_state(now, state, self._motion.q)
-                trouble = trouble or self._follow(now, command, commanded)
+                if self.mode is Mode.MOVING or not (command is None or commanded < self._begun):
+                    trouble = trouble or self._guard.wrong_state(now, state, self._motion.q)
+                    trouble = trouble or self._follow(now, command, commanded)
             except Exception as error:  # whatever fails, in an engine too, the arm has to stop
                 trouble = f"the safety filter failed: {error!r}"
             if trouble is not None:
@@ -215,22 +218,21 @@ class SafetyFilter:
 
     def _follow(self, now: float, command: Any, commanded: float) -> str | None:
         """Move the set-point towards a command; returns why not."""
-        if self.mode is Mode.WAITING and (command is None or commanded < self._begun):
-            return None
         if command is None:
             return "the commands have ended"
-        trouble = too_old("the command", now, commanded, self.watchdogs.command_age)
-        if trouble:
-            return trouble
         asked = self._guard.numbers(command)
         if isinstance(asked, str):
             return f"the command {asked}"
         motion = self._motion
         target = motion.clip(asked)
+        arrived = motion.resting and target == motion.q
+        trouble = too_old("the command", now, commanded, self.watchdogs.command_age)
+        if trouble and not arrived:
+            return trouble
         if target != asked and commanded != self._commanded:
             self.clipped += 1
         self._commanded, self.mode = commanded, Mode.MOVING
-        if motion.resting and target == motion.q:
+        if arrived:
             return None
         ramp = RAMP_START + (1.0 - RAMP_START) * self._moved / RAMP_TIME
         if not motion.propose(target, min(self._speed, ramp, 1.0)):
@@ -238,6 +240,7 @@ class SafetyFilter:
         if self._paths is not None:
             collision = self._paths.first_collision(motion)
             if collision is not None:
+                self.blocked = True
                 return "collision ahead" + self._touching(collision)
         motion.accept()
         self._moved += self.period
@@ -271,7 +274,8 @@ class SafetyFilter:
                 "correct the robot's model"
             )
         self._motion.rest_at(q.tolist())
-        self.mode, self.reason, self._started = Mode.WAITING, None, True
+        self.mode, self.reason, self.blocked = Mode.WAITING, None, False
+        self._started = True
         self._moved, self._now, self._begun = 0.0, now, now
 
     def _touching(self, q: Floats) -> str:

@@ -63,6 +63,25 @@ def test_before_the_first_command_the_arm_holds(mara: RobotModel) -> None:
     np.testing.assert_array_equal(old[-1].q, mara.home)
 
 
+def test_before_the_first_command_no_state_is_needed(mara: RobotModel) -> None:
+    arm = Arm(mara)
+    arm.ticks(None, 100, state=None)
+    arm.is_in(Mode.WAITING)
+    arm.tick(mara.home + 0.1, state=None)
+    assert arm.filter.reason == "the arm reports no state"
+
+
+def test_an_arm_that_rests_at_its_target_needs_no_new_command(mara: RobotModel) -> None:
+    arm, target = Arm(mara), mara.home + 0.3
+    arm.ticks(target, 200)
+    commanded = arm.now
+    held = arm.ticks(target, 300, commanded=commanded)
+    arm.is_in(Mode.MOVING)
+    np.testing.assert_array_equal(held[-1].q, target)
+    arm.ticks(target - 0.3, 20, commanded=commanded)
+    assert "the command is" in (arm.filter.reason or ""), "an old command moves nothing"
+
+
 def test_a_command_beyond_the_limits_is_cut_to_them(mara: RobotModel) -> None:
     arm = Arm(mara)
     target = np.array([mara.upper[0] + 1.0, *mara.home[1:]])
