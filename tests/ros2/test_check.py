@@ -91,7 +91,7 @@ def test_nothing_is_wrong_with_a_good_arm(ros_domain: int, mara: RobotModel) -> 
 
 CASES: list[tuple[dict[str, Any], set[str], str]] = [
     ({"names": [f"ur_{name}" for name in NAMES]}, {"states", "joints"}, "prefix 'ur_'"),
-    ({"speed": 0.5, "rival": True}, {"clock", "commands"}, "times real time"),
+    ({"speed": 0.5, "rival": True}, {"clock", "commands", "joints"}, "times real time"),
     ({"rate": 4.0}, {"rate", "jitter"}, "states a second"),
     ({"names": NAMES[:4]}, {"states", "joints"}, "motor5, motor6"),
     ({"position": 2.4}, {"limits"}, "beyond its own"),
