@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,3 +92,11 @@ def test_a_check_is_green_with_it_and_red_without(
         assert (code, wrong) == (1, {"commands"})
     code, wrong, figures = check("none.json", "--seconds", "0.5", "--domain", 102)
     assert (code, wrong, figures["latency"]) == (1, {"states", "commands"}, None)
+
+
+def test_a_browser_can_show_it(ros_domain: int) -> None:
+    with started("-m", "gym_mara.cli", "ros2", "sim", "--view", "--seconds", "30") as process:
+        assert process.stdout is not None
+        address = next(line for line in process.stdout if line.startswith("view: ")).split()[-1]
+        with urllib.request.urlopen(address, timeout=10.0) as response:
+            assert response.status == 200
