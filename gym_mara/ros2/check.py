@@ -28,8 +28,8 @@ LONGEST_GAP = 0.2
 """The longest time between two states, s."""
 CLOCKS_AGREE = (-0.005, 1.0)
 """The ages of states between which the clocks of sender and receiver agree, s."""
-REAL_TIME = (0.9, 1.1)
-"""How fast the clock of the sender may run, times real time."""
+CLOCK_ERROR = (0.1, 0.1)
+"""How much the clock of the sender may be slower or faster than real time: a part of it, and s in all, for late states."""
 OLDEST = 0.1
 """The highest age of states, s, at the 95th percentile."""
 _WAITING = 3.0
@@ -227,7 +227,7 @@ def _clock_line(arrivals: list[_Arrival]) -> tuple[Line, list[float] | None]:
         return Line(True, "clock", "the states have no stamps; their age is not known"), None
     passed = arrivals[-1].received - arrivals[0].received
     speed = float(stamps[-1] - stamps[0]) / passed
-    if not REAL_TIME[0] <= speed <= REAL_TIME[1]:
+    if abs(speed - 1.0) > CLOCK_ERROR[0] + CLOCK_ERROR[1] / passed:
         found = f"that of the sender runs at {speed:.3g} times real time"
         remedy = "it must advance in real time: start the clock or the simulation, or let it run at its speed"
         return Line(False, "clock", found, remedy), None

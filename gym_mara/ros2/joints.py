@@ -23,6 +23,11 @@ CLOCK_SET_BACK = 1.0
 SHORTEST_DIFFERENCE = 0.005
 """The shortest time over which velocities are computed from positions, s: over less, the jitter of the times counts too much."""
 
+LATE = 0.25
+"""A state is late that took so much longer on its way than the fastest of the last seconds, s. What it says is over."""
+LATE_WINDOW = 5.0
+"""Over how long the fastest is looked for, s: the clocks of sender and receiver need not agree, and may drift apart."""
+
 DUPLICATES = "duplicate joints"
 LENGTHS = "lengths that do not fit"
 UNKNOWN = "unknown joints"
@@ -31,8 +36,10 @@ NOT_FINITE = "not finite"
 BEYOND_LIMITS = "beyond the limits"
 OUT_OF_ORDER = "out of order"
 REPEATED = "repeated stamp"
+TOO_LATE = "too late"
 REASONS = (
-    *(DUPLICATES, LENGTHS, UNKNOWN, MISSING, NOT_FINITE, BEYOND_LIMITS, OUT_OF_ORDER, REPEATED),
+    *(DUPLICATES, LENGTHS, UNKNOWN, MISSING, NOT_FINITE, BEYOND_LIMITS),
+    *(OUT_OF_ORDER, REPEATED, TOO_LATE),
 )
 """Why a state is refused."""
 
@@ -48,7 +55,7 @@ class JointMap:
 
     Where a state has no velocities (none, or NaN for every joint), they are the differences of positions, over the stamps
     or, without stamps, over the times of arrival, and over at least SHORTEST_DIFFERENCE; zero in the first state. Efforts
-    that are all NaN count as none. A stamp of 0 is none.
+    that are all NaN count as none. A stamp of 0 is none. With stamps, states that arrive late are found too, see LATE.
 
     Args:
         robot: the arm.
@@ -66,6 +73,7 @@ class JointMap:
         self._names: list[str] | None = None
         self._order: NDArray[np.intp] = np.zeros(0, np.intp)
         self._stamp = 0.0
+        self._ways: list[tuple[float, float]] = []
         self._anchor: tuple[Floats, float, bool] | None = None
         self._velocity = np.zeros(robot.num_joints)
 
@@ -126,7 +134,9 @@ class JointMap:
                 f"{self.joint_names[joint]} is at {q[joint]:.6g}, and its limits are [{low:.6g}, {high:.6g}]: has it the unit rad "
                 "(m), and the zero of the URDF?",
             )
-        self._check_stamp(stamp)
+        if stamp != 0.0:
+            self._check_stamp(stamp)
+            self._check_way(received, stamp)
         own = self._difference(q, received, stamp)
         return ArmState(q, own if qd is None else qd, torque, received, stamp)
 
@@ -161,8 +171,6 @@ class JointMap:
 
     def _check_stamp(self, stamp: float) -> None:
         last = self._stamp
-        if stamp == 0.0:
-            return
         if not math.isfinite(stamp) or stamp < 0.0:
             raise _RefusedError(OUT_OF_ORDER, f"its stamp is {stamp:.6g} s")
         if last == stamp:
@@ -172,12 +180,26 @@ class JointMap:
             )
         if stamp < last:
             if last - stamp > CLOCK_SET_BACK:  # the next one is measured by the new clock
-                self._stamp, self._anchor = stamp, None
+                self._stamp, self._anchor, self._ways = stamp, None, []
             raise _RefusedError(
                 OUT_OF_ORDER,
                 f"its stamp is {last - stamp:.3f} s before that of the state before: two senders, or a clock that was set back",
             )
         self._stamp = stamp
+
+    def _check_way(self, received: float, stamp: float) -> None:
+        """Compare the time on the way with the fastest one, which stands in the last two halves of the window."""
+        way, ways = received - stamp, self._ways
+        if not ways or received - ways[-1][0] >= LATE_WINDOW / 2.0:
+            self._ways = ways = [*ways[-1:], (received, way)]
+        ways[-1] = ways[-1][0], min(ways[-1][1], way)
+        late = way - min(fastest for _, fastest in ways)
+        if late > LATE:
+            raise _RefusedError(
+                TOO_LATE,
+                f"it took {late:.3f} s longer on its way than others: the network or a machine is too busy, or the sender's clock "
+                "does not run in real time",
+            )
 
     def _difference(self, q: Floats, received: float, stamp: float) -> Floats:
         """The velocities from the differences of positions (J,)."""

@@ -43,6 +43,7 @@ class SimNode:
         clock: whether to publish /clock, the simulated time, which is then the time of the stamps too.
         domain: the ROS domain; by default that of ROS_DOMAIN_ID, or 0.
         pace: the clock that sets the pace.
+        on_tick: is called with the state after each tick, such as for a picture.
 
     Raises:
         GymMaraError: as in `RosNode`.
@@ -55,6 +56,7 @@ class SimNode:
         clock: bool = False,
         domain: int | None = None,
         pace: Clock | None = None,
+        on_tick: Callable[[SimState], object] | None = None,
     ) -> None:
         self.arm = arm
         self.refused = 0
@@ -62,6 +64,7 @@ class SimNode:
         self.pace = Pace(arm.period, pace or WallClock())
         self._names = list(arm.robot.joint_names)
         self._touching = False
+        self._on_tick = on_tick
         self.ros = RosNode(NODE, domain=domain)
         node = self.ros.node
         self._clock = node.create_publisher(ClockMessage, "/clock", 10) if clock else None
@@ -120,6 +123,8 @@ class SimNode:
             self._mara_states.publish(self._controller_state(state, now))
         if self._actions is not None:
             self._actions.update()
+        if self._on_tick is not None:
+            self._on_tick(state)
 
     def now(self) -> float:
         """The time of the stamps, s: simulated time where /clock is published."""

@@ -63,7 +63,7 @@ class Viewer:
         self._backend: str | None = None
         self._due = self._drawn = self._plotted = 0.0
         gate = Gate(settings.viewer_host)
-        self._server = _start_server(settings, simulation.robot.name, gate)
+        self._server = start_server(settings, simulation.robot.name, gate)
         self.url = f"http://{settings.viewer_host}:{self._server.get_port()}"
         """The address to open in a browser."""
         view, scene = view_of(simulation, 0), Scene(simulation.robot)
@@ -114,7 +114,7 @@ class Viewer:
             self.show()
         if now - self._plotted >= _PLOT_PERIOD or not self._playing:
             self._plotted = now
-            with _sender_errors_ignored():
+            with sender_errors_ignored():
                 self._panel.update(self._simulation, follow=not self._jogging)
         return outcome
 
@@ -122,7 +122,7 @@ class Viewer:
         """Draw the arm in its current state, and the target if the program has moved it, as a new episode does."""
         self._drawn = time.monotonic()
         view, goal = view_of(self._simulation, 0), self._simulation.goal
-        with _sender_errors_ignored():
+        with sender_errors_ignored():
             self._scene.show(view)
             if goal is not self._shown_goal:
                 self._shown_goal = goal
@@ -150,7 +150,7 @@ class Viewer:
         """Notify the connected browsers and stop the server."""
         clients = self._server.get_clients().values()
         for client in clients:
-            with _sender_errors_ignored():
+            with sender_errors_ignored():
                 client.add_notification(
                     "Closed", "The environment was closed; the arm no longer moves."
                 )
@@ -226,7 +226,7 @@ class Viewer:
 
 
 @contextmanager
-def _sender_errors_ignored() -> Iterator[None]:
+def sender_errors_ignored() -> Iterator[None]:
     """Ignore two races in viser.
 
     It wakes its sender thread through an asyncio event that is not thread-safe: the message is already queued, and the next
@@ -240,7 +240,7 @@ def _sender_errors_ignored() -> Iterator[None]:
             raise
 
 
-def _start_server(settings: RenderSettings, robot: str, gate: Gate) -> viser.ViserServer:
+def start_server(settings: RenderSettings, robot: str, gate: Gate) -> viser.ViserServer:
     """Start a server with this gate on the configured port, or on the next free port.
 
     Raises:

@@ -153,6 +153,30 @@ def test_of_two_senders_with_two_clocks_one_counts(joint_map: JointMap) -> None:
     assert all(accepted) or not any(accepted[1:])
 
 
+@pytest.mark.parametrize("offset", [0.0, 1.7e9])
+def test_a_state_that_is_long_on_its_way_is_refused(joint_map: JointMap, offset: float) -> None:
+    """The offset of the clocks does not matter."""
+
+    def read(tick: int, delay: float) -> bool:
+        time = 10.0 + 0.02 * tick
+        state = joint_map.read(NAMES, Q, received=time + delay, stamp=time + offset)
+        return state is not None
+
+    assert all(read(tick, 0.001 + 0.1 * (tick % 3 == 0)) for tick in range(400))
+    assert not any(read(tick, 0.5) for tick in range(400, 500))
+    assert joint_map.refused == {joints.TOO_LATE: 100}
+    assert read(500, 0.001)
+
+
+@pytest.mark.parametrize("speed", [0.97, 1.03])
+def test_a_clock_that_is_a_little_slow_or_fast_is_not_late(
+    joint_map: JointMap, speed: float
+) -> None:
+    for tick in range(5000):
+        time = 10.0 + 0.02 * tick
+        assert joint_map.read(NAMES, Q, received=time, stamp=5.0 + speed * time) is not None
+
+
 def test_states_without_stamps_are_accepted(joint_map: JointMap) -> None:
     for received in (1.0, 1.0, 2.0):
         assert joint_map.read(NAMES, Q, received=received) is not None
@@ -162,7 +186,7 @@ def test_states_without_stamps_are_accepted(joint_map: JointMap) -> None:
 def test_missing_velocities_are_differences(joint_map: JointMap, stamped: bool) -> None:
     for tick in range(5):
         time = 50.0 + 0.02 * tick
-        late = 0.3 * (tick % 2) if stamped else 0.0  # the times of arrival do not count
+        late = 0.2 * (tick % 2) if stamped else 0.0  # the times of arrival do not count
         stamp = time if stamped else 0.0
         values = [q + 0.5 * 0.02 * tick for q in Q]
         state = joint_map.read(NAMES, values, received=time + late, stamp=stamp)

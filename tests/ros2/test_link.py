@@ -57,13 +57,13 @@ def state(stamp: float, **values: Any) -> Any:
 
 
 class Arm:
-    """Publishes a state whenever it is asked for, with a stamp that advances."""
+    """Publishes a state whenever it is asked for, with a stamp that advances, so fast that none is late."""
 
     def __init__(self, peer: Peer, topic: str = "/joint_states") -> None:
         self.publisher = peer.publisher(JointState, topic)
         self.time = 100.0
 
-    def publish(self, advance: float = 0.02, **values: Any) -> bool:
+    def publish(self, advance: float = 0.5, **values: Any) -> bool:
         self.time += advance
         self.publisher.publish(state(self.time, **values))
         return True

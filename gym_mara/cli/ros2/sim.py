@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from typing import Annotated, Any
 
 import typer
@@ -11,6 +12,7 @@ from gym_mara.backends import make_backend
 from gym_mara.cli.common import backend_name, interruptible, keyword_arguments, number, out
 from gym_mara.cli.ros2.options import DomainOption, RobotOption
 from gym_mara.robot import RobotModel, RobotOptions
+from gym_mara.state import SimState
 
 
 def sim(
@@ -38,6 +40,9 @@ def sim(
     clock: Annotated[
         bool, typer.Option("--clock", help="Publish the simulated time on /clock.")
     ] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the arm in the browser; needs the extra render.")
+    ] = False,
     domain: DomainOption = None,
     seconds: Annotated[
         float | None,
@@ -63,10 +68,29 @@ def sim(
         of_robot["ee_frame"] = options.pop("ee_frame")
     options.setdefault("control_period", control_period)
     model = RobotModel.load(robot, **of_robot)
-    with interruptible("Stopped."), closing(make_backend(backend, model, 1, options)) as engine:
-        with closing(SimNode(SimulatedArm(engine), clock=clock, domain=domain)) as node:
-            out.print(f"ready: {node.summary}", soft_wrap=True, highlight=False)
-            out.file.flush()
-            node.run(seconds)
+    with interruptible("Stopped."), ExitStack() as stack:
+        engine = stack.enter_context(closing(make_backend(backend, model, 1, options)))
+        arm = SimulatedArm(engine)
+        on_tick = _shown(stack, model) if view else None
+        node = stack.enter_context(
+            closing(SimNode(arm, clock=clock, domain=domain, on_tick=on_tick))
+        )
+        out.print(f"ready: {node.summary}", soft_wrap=True, highlight=False)
+        out.file.flush()
+        node.run(seconds)
         if node.pace.missed:
             out.print(f"{node.pace.missed} ticks were missed", soft_wrap=True, highlight=False)
+
+
+def _shown(stack: ExitStack, model: RobotModel) -> Callable[[SimState], None]:
+    """Open a window that shows the arm; returns what draws a state there."""
+    from gym_mara.viewer.window import Window
+
+    window = stack.enter_context(closing(Window(model)))
+    out.print(f"view: {window.url}", soft_wrap=True, highlight=False)
+
+    def draw(state: SimState) -> None:
+        contacts = () if state.contacts is None else state.contacts[0]
+        window.show(state.q[0], frozenset(link for contact in contacts for link in contact.links))
+
+    return draw
