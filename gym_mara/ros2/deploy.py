@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,9 @@ import numpy as np
 from gym_mara.backends.ros2 import Ros2Backend
 from gym_mara.deploy import OnnxPolicy
 from gym_mara.envs import make_vector_env
+from gym_mara.envs.given import Given
 from gym_mara.envs.streams import Streams
+from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.driver import ArmStoppedError, Timing
 from gym_mara.types import Floats
@@ -108,7 +111,10 @@ class Deployment:
         """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
         self.oriented = bool(getattr(simulation.task, "orientation", False))
         """Whether targets have an orientation."""
+        self._workspace = RobotWorkspace(simulation.robot)  # of the thread that checks targets
+        self._checks = ThreadPoolExecutor(1, "gym_mara targets")
         self._asked: Target | None = None
+        self._next: Target | None = None
         self._target: Target | None = None
         self._lock = threading.Lock()
         self._ended = False
@@ -142,8 +148,9 @@ class Deployment:
         assert isinstance(link, RosLink)
         return link.node
 
-    def aim(self, target: Target) -> None:
-        """Reach for a target from the next step on. It may be called from any thread.
+    def aim(self, target: Target) -> Future[None]:
+        """Reach for a target once it is checked, in a thread of its own: that takes long if it is out of reach. A target that is
+        refused changes nothing. It may be called from any thread.
 
         Raises:
             GymMaraError: the task has a target of its own.
@@ -154,14 +161,31 @@ class Deployment:
             )
         with self._lock:
             self._asked = target
+        return self._checks.submit(self._consider)
+
+    def _consider(self) -> None:
+        """Check the newest target that is not checked yet."""
+        with self._lock:
+            asked, self._asked = self._asked, None
+        if asked is None:
+            return
+        try:
+            self.check(asked)
+        except GymMaraError as error:
+            self._log(f"the target {[*asked.position]} is refused: {error}")
+        else:
+            with self._lock:
+                self._next = asked
 
     def check(self, target: Target) -> None:
-        """Check a target, before `run`.
+        """Check a target.
 
         Raises:
             GymMaraError: it is out of reach, or reached only with a collision, or not of the form that the task takes.
         """
-        self.simulation.episodes.given(_as_options(target))
+        simulation = self.simulation
+        one = np.ones(1, np.bool_)
+        Given.of(_as_options(target), simulation.task, simulation.robot, self._workspace, one)
 
     def stop(self, reason: str) -> None:
         """Decelerate to a hold until `resume`. It may be called from any thread."""
@@ -190,7 +214,7 @@ class Deployment:
         """
         end = np.inf if seconds is None else self._clock.now() + seconds
         while not self._over(end):
-            if not self.follows or self._take_target(None):
+            if not self.follows or self._take_target(began=False):
                 self._episode(end)
             else:
                 self._status = "waits for a target"
@@ -202,20 +226,14 @@ class Deployment:
     def _wait(self) -> None:
         self._clock.sleep_until(self._clock.now() + _WAIT)
 
-    def _take_target(self, observation: Any) -> bool:
-        """Whether there is a target; a new one is checked first, and the old one stays where it is refused."""
+    def _take_target(self, began: bool) -> bool:
+        """Whether there is a target; an episode that has begun goes on with a new one."""
         with self._lock:
-            asked, self._asked = self._asked, None
-        if asked is not None:
-            try:
-                self.check(asked)
-            except GymMaraError as error:
-                self._log(f"the target {[*asked.position]} is refused: {error}")
-            else:
-                self._target = asked
-                if observation is not None:
-                    quaternion = asked.quaternion or (1.0, 0.0, 0.0, 0.0)
-                    self.simulation.set_goal(asked.position, quaternion)
+            new, self._next = self._next, None
+        if new is not None:
+            self._target = new
+            if began:
+                self.simulation.set_goal(new.position, new.quaternion or (1.0, 0.0, 0.0, 0.0))
         return self._target is not None
 
     def _episode(self, end: float) -> None:
@@ -226,7 +244,7 @@ class Deployment:
             self._status = "moves"
             while not self._over(end):
                 if self.follows:
-                    self._take_target(observation)
+                    self._take_target(began=True)
                 outcome = simulation.step(self._act(observation))
                 observation = outcome.observation
                 self._note(outcome.info)
@@ -279,6 +297,7 @@ class Deployment:
 
     def close(self) -> None:
         """Stop the arm, and end the connection."""
+        self._checks.shutdown(cancel_futures=True)
         self._arms.close()
 
 

@@ -57,7 +57,7 @@ class SafetyFilter:
     From each set-point a stop that keeps the limits of acceleration and jerk is known. It stays within the joint limits, and neither
     it nor the way to the set-point collides. A set-point without one is refused: the arm follows the last stop, and the stop is
     latched. So are a command that is no J finite numbers, a state that is too old, a command that is too old while the arm moves, an
-    arm that does not follow its set-points, and a clock that does not advance. A target beyond the joint limits is cut to them. Commands take effect only after
+    arm that does not follow its set-points, a pause between ticks while it moves, and a clock that does not advance. A target beyond the joint limits is cut to them. Commands take effect only after
     `start`; after a stop only after `resume`.
 
     It replaces no emergency stop. Its methods may be called from any thread.
@@ -208,6 +208,7 @@ class SafetyFilter:
                 trouble = wrong_clock(before, now)
                 if self.mode is Mode.MOVING or not (command is None or commanded < self._begun):
                     trouble = trouble or self._guard.wrong_state(now, state, self._motion.q)
+                    trouble = trouble or self._pause(before, now)
                     trouble = trouble or self._follow(now, command, commanded)
             except Exception as error:  # whatever fails, in an engine too, the arm has to stop
                 trouble = f"the safety filter failed: {error!r}"
@@ -215,6 +216,12 @@ class SafetyFilter:
                 self.stop(trouble)
         if self.mode is Mode.STOPPING and self._motion.follow_stop():
             self.mode = Mode.STOPPED
+
+    def _pause(self, before: float, now: float) -> str | None:
+        """What is wrong with the time since the last tick: without set-points the arm's controller has stopped it."""
+        if self._motion.resting or now - before <= self.watchdogs.state_age:
+            return None
+        return f"no set-point was sent for {now - before:.3g} s, and the arm moved"
 
     def _follow(self, now: float, command: Any, commanded: float) -> str | None:
         """Move the set-point towards a command; returns why not."""

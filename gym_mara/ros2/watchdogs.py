@@ -22,7 +22,7 @@ class Watchdogs:
     """
 
     state_age: float = 0.1
-    """The largest age of the measured state, s."""
+    """The largest age of the measured state, and the longest time between two set-points of a moving arm, s."""
     command_age: float = 0.2
     """The largest age of the command, s."""
     tracking_error: float = 0.2

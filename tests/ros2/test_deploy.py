@@ -60,7 +60,7 @@ def _error(deployment: Deployment, target: Target) -> float:
 def test_it_reaches_a_target_and_follows_the_next_one(deploy: Callable[..., Deployment]) -> None:
     deployment = deploy()
     for target in (NEAR, OTHER, NEAR):
-        deployment.aim(target)
+        deployment.aim(target).result()
         deployment.run(8.0)
         assert _error(deployment, target) < 1e-4
         assert deployment.diagnostics.error == pytest.approx(_error(deployment, target), abs=1e-6)
@@ -83,13 +83,13 @@ def test_a_target_out_of_reach_is_refused_and_the_last_one_stays(
     q = _arm(deployment).q.copy()
     with pytest.raises(GymMaraError, match="reach"):
         deployment.check(AWAY)
-    deployment.aim(AWAY)
+    deployment.aim(AWAY).result()
     deployment.run(2.0)
     np.testing.assert_array_equal(_arm(deployment).q, q)
     assert "refused" in notes[0]
-    deployment.aim(NEAR)
+    deployment.aim(NEAR).result()
     deployment.run(6.0)
-    deployment.aim(AWAY)
+    deployment.aim(AWAY).result()
     deployment.run(1.0)
     assert _error(deployment, NEAR) < 1e-4
     assert len(notes) == 2
@@ -98,7 +98,7 @@ def test_a_target_out_of_reach_is_refused_and_the_last_one_stays(
 def test_a_stop_is_latched_until_the_operator_resumes(deploy: Callable[..., Deployment]) -> None:
     notes: list[str] = []
     deployment = deploy(notes.append)
-    deployment.aim(NEAR)
+    deployment.aim(NEAR).result()
     deployment.run(0.7)
     deployment.stop("somebody asked")
     deployment.run(2.0)
@@ -115,7 +115,7 @@ def test_a_stop_is_latched_until_the_operator_resumes(deploy: Callable[..., Depl
 
 def test_an_arm_that_falls_silent_stops_where_it_is(deploy: Callable[..., Deployment]) -> None:
     deployment = deploy()
-    deployment.aim(NEAR)
+    deployment.aim(NEAR).result()
     deployment.run(0.7)
     arm = _arm(deployment)
     arm.silent_since = _clock(deployment).now()
@@ -131,7 +131,7 @@ def test_an_arm_that_falls_silent_stops_where_it_is(deploy: Callable[..., Deploy
 
 def test_without_live_nothing_is_sent(deploy: Callable[..., Deployment]) -> None:
     deployment = deploy(live=False)
-    deployment.aim(NEAR)
+    deployment.aim(NEAR).result()
     deployment.run(2.0)
     assert not _arm(deployment).sent
 

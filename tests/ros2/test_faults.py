@@ -50,15 +50,12 @@ class Stage:
         self.peer.ros.node.create_subscription(JointState, "/joint_states", self._see, SENSOR_DATA)
         self.diagnostics = self.peer.heard(DiagnosticArray, "/diagnostics")
         self.targets = self.peer.publisher(PoseStamped, "/gym_mara/target")
-        self.states = self.peer.publisher(JointState, "/joint_states")
-        self.commands = self.peer.publisher(
-            Float64MultiArray, "/forward_position_controller/commands"
-        )
         self.start_sim()
         self.start_deploy()
 
     def _see(self, message: Any) -> None:
-        if list(message.name) == list(MARA.joint_names) and np.isfinite(message.position).all():
+        counts = len(message.position), len(message.velocity)
+        if tuple(message.name) == MARA.joint_names and counts == (6, 6):
             self.traces[-1].append((time.monotonic(), message.position, message.velocity))
 
     def _started(self, *arguments: str) -> subprocess.Popen[str]:
@@ -159,6 +156,9 @@ def _delay(stage: Stage) -> None:
 def _nonsense(stage: Stage) -> None:
     """Messages that nobody may obey, to both sides."""
     rng, names = stage.rng, list(MARA.joint_names)
+    forward = "/forward_position_controller/commands"
+    commands = stage.peer.publisher(Float64MultiArray, forward)
+    states = stage.peer.publisher(JointState, "/joint_states")
     for _ in range(10):
         for state in (
             JointState(name=names, position=[float("nan")] * 6),
@@ -166,13 +166,15 @@ def _nonsense(stage: Stage) -> None:
             JointState(name=["other"], position=[0.0]),
             JointState(name=names, position=rng.uniform(-1, 1, 4).tolist()),
         ):
-            stage.states.publish(state)
+            states.publish(state)
         for values in ([float("inf")] * 6, [0.1] * 3, []):
-            stage.commands.publish(Float64MultiArray(data=values))
+            commands.publish(Float64MultiArray(data=values))
         far = PoseStamped()
         far.pose.position.x = float(rng.choice([np.nan, 9.0]))
         stage.targets.publish(far)
         time.sleep(0.01)
+    for publisher in (commands, states):
+        stage.peer.ros.node.destroy_publisher(publisher)
 
 
 FAULTY = (_kill_deploy, _kill_sim, _freeze_deploy, _freeze_sim, _delay, _nonsense)

@@ -69,6 +69,14 @@ TROUBLES: dict[str, tuple[dict[str, Callable[[Arm], Any]], str]] = {
     "clock back": ({"now": lambda arm: arm.now - 5.0}, r"the clock jumps from 11\.3 to 6\.3 s"),
     "no clock": ({"now": lambda arm: np.nan}, r"the clock jumps from 11\.3 to nan s"),
     "clock ahead": ({"now": lambda arm: arm.now + 5.0}, r"the arm's state is 4\.99 s old"),
+    "paused": (
+        {
+            "now": lambda arm: arm.now + 0.5,
+            "state": lambda arm: state_of(arm.q, arm.now + 0.5),
+            "commanded": lambda arm: arm.now + 0.5,
+        },
+        r"no set-point was sent for 0\.5 s, and the arm moved",
+    ),
     "broken state": ({"state": lambda arm: "no state"}, "the safety filter failed: AttributeError"),
 }
 
