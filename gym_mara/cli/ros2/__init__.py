@@ -8,7 +8,7 @@ from gym_mara.cli.ros2 import check, deploy, sim
 
 app = typer.Typer(
     name="ros2",
-    help="Connect policies to an arm of ROS 2, simulated or real.",
+    help="Connect policies to an arm of ROS 2, simulated or real. Needs the extra ros2.",
     no_args_is_help=True,
 )
 app.command()(check.check)
