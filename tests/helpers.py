@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gym_mara import cli
-from gym_mara.backends import backend_names
+from gym_mara.backends import simulated_backends
 from gym_mara.robot import RobotModel
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,7 @@ DEVICES: dict[str, dict[str, Any]] = {"warp": {"device": WARP_DEVICE}}
 """The settings that a backend needs on this machine, by its name."""
 EVERY_BACKEND = [
     pytest.param(name, marks=pytest.mark.slow if name in DEVICES else ())
-    for name in backend_names()
+    for name in simulated_backends()
 ]
 
 MODULAR_ARMS: dict[int, list[str]] = {

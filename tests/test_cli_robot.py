@@ -9,7 +9,7 @@ from typing import Any
 import imageio.v3 as imageio
 import pytest
 
-from gym_mara.backends import backend_names, usable_backends
+from gym_mara.backends import simulated_backends, usable_backends
 from gym_mara.robot import RobotModel
 from tests.helpers import Cli, write
 from tests.robot.arms import FOLDED, LIMIT, TOOL, UPRIGHT_REACH, arm, arm_file
@@ -48,7 +48,7 @@ def test_the_json_has_the_same(gym_mara: Cli, tmp_path: Path) -> None:
     }
     assert found["reach"] == pytest.approx(UPRIGHT_REACH - 0.02, abs=1e-3)
     assert found["pairs"]["checked"] == [["base", "l2"], ["base", "l3"], ["l1", "l3"]]
-    assert list(found["backends"]) == backend_names()
+    assert list(found["backends"]) == simulated_backends()
     assert {name for name, error in found["backends"].items() if error is None} == set(
         usable_backends()[0]
     )

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gym_mara import regression
-from gym_mara.backends import backend_names
+from gym_mara.backends import simulated_backends
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import TASKS
 from gym_mara.tasks.reach import ReachTask
@@ -23,7 +23,7 @@ RECORDS = Path(__file__).parent / "rewards"
 
 
 # The backend "warp" computes in single precision, on a GPU.
-@pytest.mark.parametrize("backend", [name for name in backend_names() if name != "warp"])
+@pytest.mark.parametrize("backend", [name for name in simulated_backends() if name != "warp"])
 @pytest.mark.parametrize("task", TASKS)
 def test_the_rewards_match_the_stored_records(
     check_rewards: Callable[..., None], task: str, backend: str

@@ -138,7 +138,9 @@ def make_backend(
         "num_envs",
         num_envs,
         at_most=backend.most_arms,
-        reason=f"the arms of the backend {name!r} take too much memory",
+        reason=f"the backend {name!r} moves one arm"
+        if backend.most_arms == 1
+        else f"the arms of the backend {name!r} take too much memory",
     )
     for option in options:
         if option not in settings:

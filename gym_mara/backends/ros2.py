@@ -94,7 +94,7 @@ class Ros2Backend(Backend):
         safety = SafetyFilter(robot, period, limits, watchdogs, make_checker(collision, robot))
         live = flag("live", live)
         link, clock = self._connect(
-            profile, controller=controller, namespace=namespace, domain=domain
+            profile, controller=controller, namespace=namespace, domain=domain, commands=live
         )
         self.clock: Clock = clock
         """Sets the pace."""
@@ -109,11 +109,11 @@ class Ros2Backend(Backend):
             self.driver.close()
             raise
 
-    def _connect(self, profile: str, **topics: Any) -> tuple[Link, Clock]:
+    def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
         """The connection to the arm, which has reported its state, and the clock."""
         from gym_mara.ros2.link import RosLink
 
-        link = RosLink(self.robot, profile, **topics)
+        link = RosLink(self.robot, profile, **options)
         try:
             link.wait(_CONNECTING)
         except BaseException:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gym_mara.backends import backend_names, make_backend
+from gym_mara.backends import make_backend, simulated_backends
 from gym_mara.robot import RobotModel
 from gym_mara.testing import BackendContract, Make
 from tests.helpers import DEVICES, MODULAR_ARMS, robot_model, write
@@ -61,7 +61,7 @@ SERVOS = {"servo_gain": 10.0}
 WARP = DEVICES["warp"] | {"control_period": 0.008, "physics_step": 0.004, "max_contacts": 96}
 OTHER_ROBOTS = ("3 joints", "7 joints", "rail")
 CASES = {
-    **{name: Case(name) for name in backend_names()},
+    **{name: Case(name) for name in simulated_backends()},
     "fake": Case("fake"),
     "warp": Case("warp", WARP),
     "warp, kinematic": Case("warp", WARP | {"dynamics": False}),

@@ -71,7 +71,7 @@ class FakeRos2Backend(Ros2Backend):
     clock: FakeClock  # type: ignore[assignment]
     arm: FakeArm
 
-    def _connect(self, profile: str, **topics: Any) -> tuple[Link, Clock]:
+    def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
         self.clock = FakeClock(lambda: self.driver)
         q = self.robot.home if self.start_q is None else self.start_q
         self.arm = FakeArm(self.clock, q)

@@ -23,6 +23,12 @@ from gym_mara.cli.common import (
     out,
 )
 from gym_mara.cli.policies import PRETRAINED
+from gym_mara.cli.ros2.options import (
+    ControllerOption,
+    DomainOption,
+    NamespaceOption,
+    ProfileOption,
+)
 from gym_mara.errors import GymMaraError
 from gym_mara.pretrained import pretrained_file
 
@@ -53,9 +59,10 @@ def deploy(
             help="The first target, m, in the world; others come on the topic /gym_mara/target.",
         ),
     ] = None,
-    profile: Annotated[
-        str, typer.Option(metavar="NAME", help="Form of the arm's commands and states.")
-    ] = "trajectory",
+    profile: ProfileOption = "trajectory",
+    controller: ControllerOption = None,
+    namespace: NamespaceOption = "",
+    domain: DomainOption = None,
     live: Annotated[
         bool,
         typer.Option("--live", help="Move the arm. Without it, what would be sent is printed."),
@@ -73,7 +80,14 @@ def deploy(
     Every command passes the safety filter, which replaces no emergency stop. Needs the extras ros2 and deploy.
     """
     first = None if target is None else _parsed(target)
-    options = {"profile": profile, "live": live, **keyword_arguments(settings)}
+    options = {
+        "profile": profile,
+        "controller": controller,
+        "namespace": namespace,
+        "domain": domain,
+        "live": live,
+        **keyword_arguments(settings),
+    }
     with _exported(policy, env) as exported:
         from gym_mara.ros2.deploy import Deployment
         from gym_mara.ros2.deploy_node import RESUME, STOP, TARGET, DeployNode
