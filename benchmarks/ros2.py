@@ -1,32 +1,47 @@
-"""How fast the ROS 2 part is: the safety filter.
+"""How fast and how exact the ROS 2 part is: the safety filter, the simulated arm, and a policy that is deployed on it.
 
-    python benchmarks/ros2.py [--seconds 20]
+    python benchmarks/ros2.py [--parts filter sim deploy] [--seconds 60] [--targets 20]
 
-A time is that of one call on the clock of the wall. On a machine with other work its percentiles are of that work as well, so the
-time of the CPU stands beside it.
+The time of the filter is that of one call on the clock of the wall. On a machine with other work its percentiles are of that work as
+well, so the time of the CPU stands beside it. The simulated arm and the policy are two processes, each on one core, in a ROS domain
+of this machine alone. The policy is the pretrained one of MARAReach-v0; it gets a new random target every four seconds.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.collision import CollisionChecker, make_checker
-from gym_mara.collision.free_poses import ROOM
+from gym_mara.collision.free_poses import ROOM, FreePoses
+from gym_mara.deploy import OnnxPolicy
+from gym_mara.pretrained import pretrained_file
 from gym_mara.robot import RobotModel
 from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.ros2.arm import ArmState
 from gym_mara.ros2.motion import MotionLimits
 from gym_mara.ros2.safety import Mode, SafetyFilter
 
+if TYPE_CHECKING:
+    from gym_mara.ros2.deploy import Deployment
+
 Floats = NDArray[np.float64]
 RATE = 100.0
 """Ticks of the filter in a second."""
 POLICY_RATE = 20.0
 """Commands in a second."""
+PARTS = ("filter", "sim", "deploy")
+HOLD = 4.0
+"""How long a target stays, s: the length of an episode of MARAReach-v0."""
 
 
 def main() -> None:
@@ -34,12 +49,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--robot", default="mara", help="the arm (mara)")
+    parser.add_argument("--robot", default="mara", help="the arm of the filter (mara)")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--targets", type=int, default=20, help="of the policy, for a profile (20)")
     parser.add_argument(
-        "--seconds", type=float, default=60.0, help="of simulated motion for each line (60)"
+        "--seconds",
+        type=float,
+        default=60.0,
+        help="of motion for each line of the filter and the simulation (60)",
     )
     arguments = parser.parse_args()
-    safety_filter(RobotModel.load(arguments.robot), arguments.seconds)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    if "filter" in arguments.parts:
+        safety_filter(RobotModel.load(arguments.robot), arguments.seconds)
+    if "sim" in arguments.parts:
+        simulated_arm(arguments.seconds)
+    if "deploy" in arguments.parts:
+        deployment(arguments.targets)
 
 
 def safety_filter(robot: RobotModel, seconds: float) -> None:
@@ -110,6 +137,82 @@ def _free(
 def _percentiles(seconds: Floats) -> str:
     p50, p99 = np.percentile(1e6 * seconds, [50, 99])
     return f"p50 {p50:.0f} µs, p99 {p99:.0f} µs"
+
+
+@contextmanager
+def _simulation(*options: str) -> Iterator[subprocess.Popen[str]]:
+    """A simulated MARA as a process on the last core."""
+    command = [sys.executable, "-m", "gym_mara.cli", "ros2", "sim", *options]
+    core = {max(os.sched_getaffinity(0))}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.sched_setaffinity(0, core)
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line.startswith("ready"):
+            raise SystemExit(f"the simulated arm did not start: {line}")
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def simulated_arm(seconds: float) -> None:
+    """Print how many ticks a simulated arm misses in real time."""
+    for backend in ("dart", "mujoco"):
+        with _simulation("--backend", backend, "--seconds", str(seconds)) as process:
+            rest, _ = process.communicate()
+        missed = rest.split()[0] if "missed" in rest else "0"
+        print(
+            f"sim: {backend}, one core, {50 * seconds:.0f} ticks at 50 Hz: {missed} missed",
+            flush=True,
+        )
+
+
+def deployment(targets: int) -> None:
+    """Print how punctual a deployed policy is, and how near it comes to random targets, with each profile."""
+    from gym_mara.ros2.deploy import Deployment
+
+    robot = RobotModel.load("mara")
+    policy = OnnxPolicy(pretrained_file("MARAReach-v0"))
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    for profile in ("trajectory", "forward", "mara-2019"):
+        with _simulation("--backend", "dart"):
+            deployed = Deployment(policy, None, {"profile": profile, "live": True}, print)
+            try:
+                errors, stops = _errors(deployed, robot, targets)
+                found = deployed.diagnostics
+            finally:
+                deployed.close()
+        ticks = found.setpoints
+        late = [1e3 * value for value in (*ticks.lateness, *found.lateness)]
+        print(
+            f"deploy: {profile}, {targets} targets on dart: error p50 {np.median(errors):.4f}, p95 {np.quantile(errors, 0.95):.4f} mm, "
+            f"{stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
+            f"{ticks.missed} of {ticks.ticks} missed; actions at 50 Hz: late by p50 {late[3]:.2f}, p99 {late[4]:.2f} ms, "
+            f"{found.missed_ticks} of {found.steps} missed",
+            flush=True,
+        )
+
+
+def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floats, int]:
+    """The distance to each target at its end, mm, and how often the filter stopped the arm."""
+    from gym_mara.ros2.deploy import Target
+
+    rng, poses = np.random.default_rng(0), FreePoses(robot)
+    errors, stops = [], 0
+    for _ in range(targets):
+        position, _ = poses.draw(rng)
+        deployed.aim(Target(tuple(position.tolist()))).result()
+        deployed.run(HOLD)
+        if deployed.diagnostics.status.startswith("stopped"):
+            stops += 1
+            deployed.resume()
+            continue
+        away = deployed.backend.state.ee_position[0] - position
+        errors.append(1e3 * float(np.linalg.norm(away)))
+    return np.array(errors or [np.nan]), stops
 
 
 if __name__ == "__main__":

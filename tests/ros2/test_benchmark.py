@@ -14,8 +14,19 @@ pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "ros2.py"
 
 
+def test_a_simulated_arm_and_a_policy_on_it_are_measured() -> None:
+    command = [sys.executable, str(SCRIPT), "--parts", "sim", "deploy", "--seconds", "1"]
+    done = subprocess.run(
+        [*command, "--targets", "1"], check=False, capture_output=True, text=True, timeout=180
+    )
+    assert done.returncode == 0, done.stderr
+    found = re.findall(r"^(\w+: [\w-]+), ", done.stdout, re.MULTILINE)
+    profiles = ("trajectory", "forward", "mara-2019")
+    assert found == ["sim: dart", "sim: mujoco", *(f"deploy: {name}" for name in profiles)]
+
+
 def test_the_filter_is_measured_with_and_without_collision_checks() -> None:
-    command = [sys.executable, str(SCRIPT), "--seconds", "1"]
+    command = [sys.executable, str(SCRIPT), "--parts", "filter", "--seconds", "1"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     for name in ("kinematic checks", "with the collision checks"):
