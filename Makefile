@@ -7,7 +7,7 @@ READY = $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test test-slow lint bench experiment test-oldest test-rllib test-wheel clean
+.PHONY: demo test test-slow lint bench experiment test-kilted test-oldest test-rllib test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
@@ -36,6 +36,9 @@ experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four en
 test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and commands with the oldest supported Gymnasium.
 	.venv-oldest/bin/python -m pytest -n auto -m "not slow and not nightly" $(GYMNASIUM_TESTS)
 
+test-kilted: .venv-kilted/.ready ## Run the tests with ROS 2 with the wheels of Kilted; all others use those of Jazzy.
+	.venv-kilted/bin/python -m pytest -n auto -m "not nightly" tests/ros2
+
 test-rllib: ## Run the RLlib example, which pins an older Gymnasium, in a separate virtual environment.
 	$(MAKE) .venv-rllib/.ready VENV=.venv-rllib EXTRAS=rllib
 	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
@@ -44,7 +47,7 @@ test-wheel: ## Build the wheel, install it outside the checkout, and use every e
 	.ci/test-wheel $(PYTHON)
 
 clean: ## Remove the virtual environments and the files of the tools.
-	rm -rf .venv .venv-bench .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-bench .venv-kilted .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
@@ -58,12 +61,24 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	$(BIN)/python $(PIP_INSTALL) -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
 	touch $@
 
-# The oldest Gymnasium alone is installed here. All other packages are those of $(VENV).
+# What replaces a library of $(VENV) is installed here. All other packages are those of $(VENV). The name of the file that says so
+# is the last one, so that what is installed here comes first.
+PACKAGES = 'import sysconfig; print(sysconfig.get_path("purelib"))'
+define OTHERS_FROM_VENV
+	others=$$($(BIN)/python -c $(PACKAGES)); \
+	echo "import site; site.addsitedir('$$others')" >$$($(@D)/bin/python -c $(PACKAGES))/zz_others.pth
+endef
+
 .venv-oldest/.ready: $(READY) constraints-oldest.txt
-	$(PYTHON) -m venv .venv-oldest
-	.venv-oldest/bin/python $(PIP_INSTALL) --no-deps -r constraints-oldest.txt
-	packages='import sysconfig; print(sysconfig.get_path("purelib"))'; \
-	others=$$($(BIN)/python -c "$$packages"); \
-	echo "import site; site.addsitedir('$$others')" >$$(.venv-oldest/bin/python -c "$$packages")/others.pth
-	.venv-oldest/bin/python -c 'import gymnasium; assert gymnasium.__version__.startswith("1.1."), gymnasium.__version__'
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python $(PIP_INSTALL) --no-deps -r constraints-oldest.txt
+	$(OTHERS_FROM_VENV)
+	$(@D)/bin/python -c 'import gymnasium; assert gymnasium.__version__.startswith("1.1."), gymnasium.__version__'
+	touch $@
+
+.venv-kilted/.ready: $(READY)
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python $(PIP_INSTALL) ros-kilted-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-kilted-common-interfaces==5.5.1
+	$(OTHERS_FROM_VENV)
+	$(@D)/bin/python -c 'import rclpy, sys; assert rclpy.__file__.startswith(sys.prefix), rclpy.__file__'
 	touch $@
