@@ -23,15 +23,15 @@ _TRAVELLING = _COMMON | {
 }
 _ANY_TARGET: dict[str, Any] = {
     "buffer_size": 1_000_000,
-    "batch_size": 512,
+    "batch_size": 256,
     "train_freq": 1,
     "gradient_steps": 4,
     "learning_starts": 10_000,
-    "gamma": 0.98,
+    "gamma": 0.95,
     "tau": 0.01,
-    "learning_rate": ((0.0, 7e-4), (1.0, 0.0)),
+    "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
     "ent_coef": "auto_0.1",
-    "policy_kwargs": {"net_arch": [256, 256]},
+    "policy_kwargs": {"net_arch": [128, 128]},
 }
 
 SEARCH_SPACE = SearchSpace(
@@ -51,7 +51,7 @@ def tuned(policy: str) -> Presets:
         travelling=Preset(num_envs=16, policy=policy, arguments=_TRAVELLING),
         families={
             "any_target": Preset(
-                num_envs=64, policy=policy, normalise_observation=True, arguments=_ANY_TARGET
+                num_envs=128, policy=policy, normalise_observation=True, arguments=_ANY_TARGET
             )
         },
     )
