@@ -39,8 +39,7 @@ test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and 
 test-kilted: .venv-kilted/.ready ## Run the tests with ROS 2 with the wheels of Kilted; all others use those of Jazzy.
 	.venv-kilted/bin/python -m pytest -n auto -m "not nightly" tests/ros2
 
-test-rllib: ## Run the RLlib example, which pins an older Gymnasium, in a separate virtual environment.
-	$(MAKE) .venv-rllib/.ready VENV=.venv-rllib EXTRAS=rllib
+test-rllib: .venv-rllib/.ready ## Run the RLlib example, which pins an older Gymnasium, with that one.
 	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
 
 test-wheel: ## Build the wheel, install it outside the checkout, and use every environment there.
@@ -74,6 +73,13 @@ endef
 	$(@D)/bin/python $(PIP_INSTALL) --no-deps -r constraints-oldest.txt
 	$(OTHERS_FROM_VENV)
 	$(@D)/bin/python -c 'import gymnasium; assert gymnasium.__version__.startswith("1.1."), gymnasium.__version__'
+	touch $@
+
+# What ray[rllib] adds to ray, and the Gymnasium that it pins.
+.venv-rllib/.ready: $(READY)
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python $(PIP_INSTALL) --no-deps gymnasium==1.2.2 ormsgpack pyarrow tensorboardX
+	$(OTHERS_FROM_VENV)
 	touch $@
 
 .venv-kilted/.ready: $(READY)
