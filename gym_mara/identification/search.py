@@ -150,7 +150,10 @@ class Search:
             self.vector[list(pair)] = tried[best][list(pair)]
 
     def leave_out_unreached(self) -> list[int]:
-        """Leave out the effort limits that were not reached: higher ones explain the log as well; returns these entries."""
+        """Leave out the effort limits that were not reached: higher ones explain the log as well; returns these entries.
+
+        The friction of such a joint does not show either, and is left out with it.
+        """
         own = [index for index in self.space.of("effort_limit") if index in self.searched]
         if not own:
             return []
@@ -164,6 +167,11 @@ class Search:
         for row, index in enumerate(own, 1):
             if squares[row] - squares[0] < _SEEN:
                 self.vector[index] = tried[row, index]
-                self.searched.remove(index)
-                unreached.append(index)
+                joint = self.space.entries[index][1]
+                friction = [
+                    i for i in self.space.of("joint_friction") if self.space.entries[i][1] == joint
+                ]
+                for each in (index, *friction):
+                    self.searched.remove(each)
+                    unreached.append(each)
         return unreached

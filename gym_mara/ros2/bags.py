@@ -140,11 +140,11 @@ def _reading(path: Path) -> Iterator[None]:
     """Raise whatever rosbags raises for a damaged file as DamagedFileError."""
     try:
         yield
-    except (GymMaraError, MemoryError):
+    except GymMaraError:
         raise
     except (
         Exception
-    ) as error:  # rosbags checks little: there are struct.error, KeyError, AssertionError, …
+    ) as error:  # rosbags checks little: there are struct.error, KeyError, MemoryError, …
         reason = str(error) or type(error).__name__
         raise DamagedFileError(f"cannot read the bag {str(path)!r}: {reason}") from error
 
@@ -243,7 +243,12 @@ class Recorder:
         """Finish the bag. A second call has no effect."""
         if self._writer.storage is not None:
             with _writing(self.folder):
-                self._writer.close()
+                try:
+                    self._writer.close()
+                except BaseException:
+                    with suppress(Exception):  # the disk is full: it can only be closed
+                        self._writer.abort()
+                    raise
 
     def __enter__(self) -> Recorder:
         return self

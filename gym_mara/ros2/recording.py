@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from gym_mara.errors import GymMaraError
-from gym_mara.extras import needs
 from gym_mara.ros2.bags import Bag, Recorder
+from gym_mara.ros2.link import DISCOVERY
+from gym_mara.ros2.node import RosNode, needs_ros
+
+with needs_ros("recording and replaying topics"):
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 KINDS = (
     "diagnostic_msgs/msg/DiagnosticArray",
@@ -23,33 +29,12 @@ KINDS = (
 """What is recorded unless topics are named: states, commands, targets and diagnostics."""
 PREFIX = "/replay"
 _POLL = 0.1
-"""How often new topics and the end are looked for, s."""
+"""How often new topics are looked for, s."""
+PATIENCE = 10.0
+"""How long the first message is waited for, s."""
 _DEPTH = 1000
-
-
-@contextmanager
-def _node(name: str) -> Iterator[tuple[Any, Callable[[float], None]]]:
-    """A node in a context of its own, and what handles its messages for at most some seconds."""
-    with needs("recording and replaying topics", "ros2", "ros-jazzy-rclpy"):
-        from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        try:
-            yield node, lambda seconds: executor.spin_once(timeout_sec=seconds)
-        finally:
-            executor.shutdown()
-            node.destroy_node()
-    finally:
-        context.try_shutdown()
+_Arrived = tuple[str, str, bytes, int]
+"""The topic, the type, the serialised message and the time, ns."""
 
 
 def message_class(kind: str) -> Any:
@@ -68,63 +53,76 @@ def message_class(kind: str) -> Any:
 
 
 def record(
-    folder: Path,
-    topics: Sequence[str] = (),
-    duration: float | None = None,
-    told: Callable[[Recorder], object] = lambda recorder: None,
+    folder: Path, topics: Sequence[str] = (), duration: float | None = None
 ) -> dict[str, int]:
     """Record topics until the duration is over or the process is interrupted; returns how many messages each has.
 
     Args:
         folder: a new folder for the bag.
         topics: their names; all of `KINDS` if none is given. They may appear later.
-        duration: s; None for no end.
-        told: called about every second.
+        duration: from the first message on, s, which is waited for at most PATIENCE longer; None for no end.
 
     Raises:
         GymMaraError: the folder exists, or cannot be written.
         MissingExtraError: ROS or `rosbags` is not installed.
     """
-    with _node("gym_mara_record") as (node, spin), Recorder(folder) as recorder:
-        subscribed: set[str] = set()
-        end = time.monotonic() + (duration if duration is not None else float("inf"))
-        next_told = time.monotonic() + 1.0
-        next_look = 0.0
-        try:
-            while (now := time.monotonic()) < end:
-                if now >= next_look:
-                    _subscribe(node, recorder, topics, subscribed)
-                    next_look = now + _POLL
-                spin(min(_POLL, end - now))
-                if now >= next_told:
-                    told(recorder)
-                    next_told = now + 1.0
-        except KeyboardInterrupt:
-            pass  # which is how a recording ends
-        return dict(recorder.counts)
+    arrived: SimpleQueue[_Arrived] = SimpleQueue()
+    node = RosNode("gym_mara_record")
+    try:
+        with Recorder(folder) as recorder:
+            subscribed: set[str] = set()
+            recording: float | None = None
+            end, look = math.inf, 0.0
+            if duration is not None:
+                end = time.monotonic() + duration + PATIENCE
+            try:
+                while (now := time.monotonic()) < end:
+                    if now >= look:
+                        _subscribe(node, recorder, topics, subscribed, arrived)
+                        look = now + _POLL
+                    _drain(recorder, arrived, min(_POLL, end - now))
+                    if duration is not None and recorder.counts and recording is None:
+                        recording = time.monotonic()
+                        end = recording + duration
+            except KeyboardInterrupt:
+                pass  # which is how a recording ends
+            _drain(recorder, arrived, 0.0)
+            return dict(recorder.counts)
+    finally:
+        node.close()
 
 
-def _subscribe(node: Any, recorder: Recorder, topics: Sequence[str], known: set[str]) -> None:
+def _drain(recorder: Recorder, arrived: SimpleQueue[_Arrived], patience: float) -> None:
+    """Write the messages that have arrived; wait for the first one."""
+    with suppress(Empty):
+        recorder.add(*arrived.get(timeout=max(patience, 1e-3)))
+        for _ in range(arrived.qsize()):
+            recorder.add(*arrived.get_nowait())
+
+
+def _subscribe(
+    node: RosNode,
+    recorder: Recorder,
+    topics: Sequence[str],
+    known: set[str],
+    arrived: SimpleQueue[_Arrived],
+) -> None:
     """Subscribe to the wanted topics that have appeared."""
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-
-    for topic, kinds in node.get_topic_names_and_types():
+    for topic, kinds in node.node.get_topic_names_and_types():
         wanted = topic in topics if topics else bool(set(kinds) & set(KINDS))
         if topic in known or not wanted or topic.startswith(f"{PREFIX}/"):
             continue
         known.add(topic)
         if len(kinds) != 1 or not recorder.knows(kinds[0]):
-            if topics:
-                raise GymMaraError(
-                    f"{topic} has messages {', '.join(kinds)}, which cannot be recorded: leave it out"
-                )
-            continue
+            raise GymMaraError(
+                f"{topic} has messages {', '.join(kinds)}, which cannot be recorded: name other topics"
+            )
 
-        def write(data: bytes, topic: str = topic, kind: str = kinds[0]) -> None:
-            recorder.add(topic, kind, data, time.time_ns())
+        def put(data: bytes, topic: str = topic, kind: str = kinds[0]) -> None:
+            arrived.put((topic, kind, data, time.time_ns()))
 
         quality = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        node.create_subscription(message_class(kinds[0]), topic, write, quality, raw=True)
+        node.node.create_subscription(message_class(kinds[0]), topic, put, quality, raw=True)
 
 
 def replay(path: Path, rate: float = 1.0) -> dict[str, int]:
@@ -148,24 +146,27 @@ def replay(path: Path, rate: float = 1.0) -> dict[str, int]:
                 f"{str(path)!r} has nothing to replay; its topics are: {', '.join(bag.topics) or 'none'}"
             )
         counts = dict.fromkeys(topics, 0)
-        with _node("gym_mara_replay") as (node, spin):
+        node = RosNode("gym_mara_replay")
+        try:
             publishers = {
-                topic: node.create_publisher(
+                topic: node.node.create_publisher(
                     message_class(bag.topics[topic]), PREFIX + topic, _DEPTH
                 )
                 for topic in topics
             }
-            _wait(time.monotonic() + 0.5, spin)  # for those who listen to find the topics
+            time.sleep(DISCOVERY)
             begin, first = time.monotonic(), None
             for connection, stamp, data in bag.raw(topics):
                 first = stamp if first is None else first
-                _wait(begin + 1e-9 * (stamp - first) / rate, spin)
+                _sleep_until(begin + 1e-9 * (stamp - first) / rate)
                 publishers[connection.topic].publish(bytes(data))
                 counts[connection.topic] += 1
-            _wait(time.monotonic() + 0.2, spin)  # for the last messages to leave
+            time.sleep(_POLL)  # for the last messages to leave
+        finally:
+            node.close()
     return counts
 
 
-def _wait(until: float, spin: Callable[[float], None]) -> None:
-    while (rest := until - time.monotonic()) > 0.0:
-        spin(min(rest, _POLL))
+def _sleep_until(instant: float) -> None:
+    while (rest := instant - time.monotonic()) > 0.0:
+        time.sleep(rest)

@@ -62,9 +62,7 @@ class Stage:
             self.traces[-1].append((time.monotonic(), message.position, message.velocity))
 
     def _started(self, *arguments: str) -> subprocess.Popen[str]:
-        process = self._stack.enter_context(
-            started("-m", "gym_mara.cli", "ros2", *arguments)
-        )
+        process = self._stack.enter_context(started("-m", "gym_mara.cli", "ros2", *arguments))
         assert process.stdout is not None
         line = "started"
         while line and not line.startswith("ready"):
