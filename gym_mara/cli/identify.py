@@ -19,6 +19,7 @@ from gym_mara.cli.common import (
     out,
     several,
 )
+from gym_mara.cli.ros2.options import CommandTopicOption, StateTopicOption
 from gym_mara.errors import GymMaraError
 from gym_mara.files import write_json
 from gym_mara.identification.identified import Identified
@@ -38,7 +39,7 @@ def identify(
         str,
         typer.Option(parser=backend_name, metavar="NAME", help="Backend with dynamics."),
     ] = "dart",
-    output: Annotated[
+    out_file: Annotated[
         Path | None, typer.Option("--out", help="New JSON file for the parameters and ranges.")
     ] = None,
     parameters: Annotated[
@@ -51,8 +52,10 @@ def identify(
     ] = _DEFAULT,
     period: Annotated[
         float,
-        typer.Option(parser=number(1e-3, 1.0), metavar="S", help="Control period, s."),
+        typer.Option(parser=number(1e-3, 1.0), metavar="X", help="Control period, s."),
     ] = 0.02,
+    command_topic: CommandTopicOption = None,
+    state_topic: StateTopicOption = None,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
     """Find the delay, servo gains, effort limits and friction with which a backend follows a real arm best.
@@ -60,18 +63,18 @@ def identify(
     The result has ranges for the keyword randomisation. Needs the extra ros2, and that of the backend.
     """
     from gym_mara.identification import identify as fit  # SciPy takes a moment to import
-    from gym_mara.ros2.logs import read_log  # rosbags is optional
+    from gym_mara.ros2.logs import STATES, read_log  # rosbags is optional
 
-    if output is not None and output.exists():
-        raise GymMaraError(f"{str(output)!r} exists and is not overwritten: delete it first")
+    if out_file is not None and out_file.exists():
+        raise GymMaraError(f"{str(out_file)!r} exists and is not overwritten: delete it first")
     arm = RobotModel.load(robot)
-    log = read_log(bag, arm, period)
+    log = read_log(bag, arm, period, states=state_topic or STATES, commands=command_topic)
     err.print(f"{log.duration:.1f} s of {arm.name}; this takes some minutes", highlight=False)
     chosen = names_in("--parameters", parameters)
     found = fit(log, arm, backend, chosen, **keyword_arguments(settings))
     _print(found)
-    if output is not None:
-        write_json(output, found.to_json(), new=True)
+    if out_file is not None:
+        write_json(out_file, found.to_json(), new=True)
 
 
 def _print(found: Identified) -> None:

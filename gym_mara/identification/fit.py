@@ -57,8 +57,9 @@ def identify(
         search.try_frictions()
         unreached = search.leave_out_unreached()
         search.descend(math.inf, 15)
+        search.try_frictions(near=True)
         unreached += search.leave_out_unreached()
-        search.descend(math.inf, 5)  # each joint now counts by its own noise
+        search.descend(math.inf, 8)  # each joint now counts by its own noise
         search.measure()
         errors = standard_errors(search, log)
     finally:

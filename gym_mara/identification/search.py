@@ -17,6 +17,8 @@ _STEP, _ROUGH_STEP = 3e-4, 1e-2
 the latency needs the larger one, a motor at its limit feels it only by whole physics steps."""
 _SMALLEST_ERROR = 1e-6
 """The precision of encoders at best, rad (m)."""
+_NEAR = np.array([0.4, 0.6, 0.75, 0.87, 0.95, 1.05, 1.15, 1.3])
+"""Parts of the present friction that are tried."""
 _SEEN = 10.0
 """An effort limit was reached if a higher one makes the sum of squares, in units of its variance, this much larger."""
 
@@ -123,19 +125,24 @@ class Search:
         vectors[:, self.searched] = self.space.natural(whole)[:, self.searched]
         return vectors
 
-    def try_frictions(self) -> None:
+    def try_frictions(self, *, near: bool = False) -> None:
         """Give each joint the best joint friction for which effort limit - friction stays.
 
         A motor that speeds up shows only that difference, so least squares may end far away on this line.
+
+        Args:
+            near: whether frictions near the present one are tried, and not all.
         """
         space, tried, changed = self.space, [self.vector], [(0, 0)]
         for effort in space.of("effort_limit"):
             for friction in space.of("joint_friction"):
                 limit = space.effort_limit(friction)
                 net = self.vector[effort] * limit - self.vector[friction]
-                if space.entries[effort][1] != space.entries[friction][1] or net <= 0.0:
+                same = space.entries[effort][1] == space.entries[friction][1]
+                if not same or effort not in self.searched or net <= 0.0:
                     continue
-                for part in FRICTIONS:
+                now = self.vector[friction] / (net + self.vector[friction])
+                for part in now * _NEAR if near else FRICTIONS:
                     vector = self.vector.copy()
                     vector[effort] = net / (1.0 - part) / limit
                     vector[friction] = part * net / (1.0 - part)

@@ -53,7 +53,11 @@ def message_class(kind: str) -> Any:
 
 
 def record(
-    folder: Path, topics: Sequence[str] = (), duration: float | None = None
+    folder: Path,
+    topics: Sequence[str] = (),
+    duration: float | None = None,
+    *,
+    domain: int | None = None,
 ) -> dict[str, int]:
     """Record topics until the duration is over or the process is interrupted; returns how many messages each has.
 
@@ -61,13 +65,14 @@ def record(
         folder: a new folder for the bag.
         topics: their names; all of `KINDS` if none is given. They may appear later.
         duration: from the first message on, s, which is waited for at most PATIENCE longer; None for no end.
+        domain: the ROS domain; by default that of ROS_DOMAIN_ID, or 0.
 
     Raises:
         GymMaraError: the folder exists, or cannot be written.
         MissingExtraError: ROS or `rosbags` is not installed.
     """
     arrived: SimpleQueue[_Arrived] = SimpleQueue()
-    node = RosNode("gym_mara_record")
+    node = RosNode("gym_mara_record", domain=domain)
     try:
         with Recorder(folder) as recorder:
             subscribed: set[str] = set()
@@ -125,7 +130,7 @@ def _subscribe(
         node.node.create_subscription(message_class(kinds[0]), topic, put, quality, raw=True)
 
 
-def replay(path: Path, rate: float = 1.0) -> dict[str, int]:
+def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[str, int]:
     """Publish the messages of a bag at the recorded pace, each on its topic under /replay; returns how many each has.
 
     No arm listens there: a replay is for looking at it.
@@ -133,6 +138,7 @@ def replay(path: Path, rate: float = 1.0) -> dict[str, int]:
     Args:
         path: the bag.
         rate: how many times as fast.
+        domain: the ROS domain; by default that of ROS_DOMAIN_ID, or 0.
 
     Raises:
         DamagedFileError: the bag is missing or damaged.
@@ -146,7 +152,7 @@ def replay(path: Path, rate: float = 1.0) -> dict[str, int]:
                 f"{str(path)!r} has nothing to replay; its topics are: {', '.join(bag.topics) or 'none'}"
             )
         counts = dict.fromkeys(topics, 0)
-        node = RosNode("gym_mara_replay")
+        node = RosNode("gym_mara_replay", domain=domain)
         try:
             publishers = {
                 topic: node.node.create_publisher(

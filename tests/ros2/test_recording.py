@@ -74,7 +74,7 @@ def test_without_an_arm(
     tmp_path: Path, ros_domain: int, gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording, "PATIENCE", 0.5)
-    code, _, error = gym_mara("ros2", "record", tmp_path / "bag", "--duration", 0.2)
+    code, _, error = gym_mara("ros2", "record", tmp_path / "bag", "--seconds", 0.2)
     assert code == 2
     assert "no messages came" in error
     code, _, error = gym_mara("ros2", "replay", tmp_path / "bag")

@@ -9,25 +9,28 @@ import typer
 from rich.table import Table
 
 from gym_mara.cli.common import err, number, out
+from gym_mara.cli.ros2.options import DomainOption
 from gym_mara.errors import GymMaraError
 
 
 def record(
     bag: Annotated[Path, typer.Argument(help="New folder for the bag.")],
-    topics: Annotated[
+    topic: Annotated[
         list[str],
         typer.Option(
-            "--topic",
             metavar="NAME",
-            help="Topic; by default all with joint states, commands, targets or diagnostics.",
+            help="Topic to record; by default all with joint states, commands, targets or diagnostics.",
         ),
     ] = [],  # noqa: B006 - Typer reads it and never changes it
-    duration: Annotated[
+    seconds: Annotated[
         float | None,
         typer.Option(
-            parser=number(0.1, 1e6), metavar="S", help="How long, s; by default until Ctrl-C."
+            parser=number(0.1, 1e6),
+            metavar="X",
+            help="How long from the first message on, s; by default until Ctrl-C.",
         ),
     ] = None,
+    domain: DomainOption = None,
 ) -> None:
     """Record the topics of an arm as a bag in MCAP, which the tools of ROS can read.
 
@@ -36,7 +39,7 @@ def record(
     from gym_mara.ros2.recording import record as run
 
     err.print("Recording; stop with Ctrl-C.")
-    counts = run(bag, topics, duration)
+    counts = run(bag, topic, seconds, domain=domain)
     _print(f"Recorded in {bag}", counts)
     if not counts:
         raise GymMaraError(
@@ -49,6 +52,7 @@ def replay(
     rate: Annotated[
         float, typer.Option(parser=number(0.01, 100.0), metavar="X", help="Times as fast.")
     ] = 1.0,
+    domain: DomainOption = None,
 ) -> None:
     """Publish the states, commands and targets of a bag on the topics /replay/…, for looking at them.
 
@@ -58,7 +62,7 @@ def replay(
     from gym_mara.ros2.recording import replay as run
 
     err.print(f"Replaying on {PREFIX}/…, which no arm listens to.")
-    _print(f"Replayed from {bag}", run(bag, rate))
+    _print(f"Replayed from {bag}", run(bag, rate, domain=domain))
 
 
 def _print(title: str, counts: dict[str, int]) -> None:
