@@ -22,6 +22,7 @@ from gym_mara.cli.common import (
 from gym_mara.cli.ros2.options import CommandTopicOption, StateTopicOption
 from gym_mara.errors import GymMaraError
 from gym_mara.files import write_json
+from gym_mara.identification.fit import identify as fit
 from gym_mara.identification.identified import Identified
 from gym_mara.identification.parameters import DEFAULT, PRIORS
 from gym_mara.robot import RobotModel
@@ -62,7 +63,6 @@ def identify(
 
     The result has ranges for the keyword randomisation. Needs the extra ros2, and that of the backend.
     """
-    from gym_mara.identification import identify as fit  # SciPy takes a moment to import
     from gym_mara.ros2.logs import STATES, read_log  # rosbags is optional
 
     if out_file is not None and out_file.exists():

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.optimize import least_squares
-
 from gym_mara.identification.following import Follower
 from gym_mara.identification.parameters import Space
 from gym_mara.identification.start import FRICTIONS
@@ -49,6 +47,8 @@ class Search:
             evaluations: at most so many.
             rough: whether to be fast, and not to mind outliers.
         """
+        from scipy.optimize import least_squares  # it takes a moment
+
         space, own = self.space, self.searched
         self.measure(segment)
 
