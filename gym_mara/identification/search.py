@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
 from gym_mara.identification.following import Follower
 from gym_mara.identification.parameters import Space
 from gym_mara.identification.start import FRICTIONS
