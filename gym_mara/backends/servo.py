@@ -131,6 +131,10 @@ class ServoBackend(Backend):
     def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
         """Put the n arms with these numbers at rest at q (n, J); returns the contacts of each there."""
 
+    def _set_state(self, arm: int, q: Floats, qd: Floats) -> None:
+        """Put one arm at q with velocities qd, both (J,); a subclass may do so without a new arm."""
+        self._rebuild(arm, q, qd)
+
     @abstractmethod
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         """Replace what the engine knows of one arm, whose state diverged, by a new arm at q and qd, both (J,)."""
@@ -159,6 +163,29 @@ class ServoBackend(Backend):
         self._q[rows], self._qd[rows], self._torque[rows] = q[rows], 0.0, 0.0
         self._targets[rows] = q[rows, None]
         self._time[rows], self._diverged[rows] = 0.0, False
+
+    def set_parameters(self, parameters: Mapping[str, Floats]) -> None:
+        """Give all arms these values instead of random ones: name → (N, …), for names that `randomisation` has."""
+        for name, values in parameters.items():
+            self._parameters[name][:] = values
+        for arm in range(self.num_envs):
+            self._apply_parameters(arm)
+
+    def continue_from(self, q: Floats, qd: Floats, targets: Floats) -> None:
+        """Put all arms in a recorded state, in motion and with the targets that may not have taken effect yet.
+
+        Args:
+            q: joint positions (N, J), rad (m).
+            qd: joint velocities (N, J), rad/s (m/s).
+            targets: the joint targets so far (K, J), the newest last; before the first one it was the same.
+        """
+        kept = np.maximum(np.arange(-self._targets.shape[1], 0), -len(targets))
+        self._targets[:] = targets[kept]
+        self._q[:], self._qd[:], self._torque[:] = q, qd, 0.0
+        self._contacts = [()] * self.num_envs
+        self._diverged[:] = False
+        for arm in range(self.num_envs):
+            self._set_state(arm, self._q[arm], self._qd[arm])
 
     def step(self, q_target: Floats) -> SimState:
         self._targets[:, :-1] = self._targets[:, 1:]

@@ -8,7 +8,16 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from gym_mara.cli import FAILED, agents, environments, experiments, robots, training, viewing
+from gym_mara.cli import (
+    FAILED,
+    agents,
+    environments,
+    experiments,
+    identify,
+    robots,
+    training,
+    viewing,
+)
 from gym_mara.cli.common import err, interruptible
 from gym_mara.cli.ros2 import app as ros2
 from gym_mara.errors import GymMaraError
@@ -43,6 +52,7 @@ app.command()(experiments.benchmark)
 app.command()(experiments.plot)
 app.command()(experiments.search)
 app.command()(robots.robot)
+app.command()(identify.identify)
 app.command("list")(environments.list_)
 app.command()(environments.rewards)
 app.add_typer(ros2)

@@ -102,6 +102,9 @@ class DartBackend(ServoBackend):
             contacts.append(self.arms[arm].contacts())
         return contacts
 
+    def _set_state(self, arm: int, q: Floats, qd: Floats) -> None:
+        self.arms[arm].set_state(q, qd)
+
     def _rebuild(self, arm: int, q: Floats, qd: Floats) -> None:
         self.arms[arm] = self._new_arm()
         self._apply_parameters(arm)

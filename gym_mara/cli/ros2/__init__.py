@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from gym_mara.cli.ros2 import check, deploy, sim
+from gym_mara.cli.ros2 import bags, check, deploy, sim
 
 app = typer.Typer(
     name="ros2",
@@ -13,4 +13,6 @@ app = typer.Typer(
 )
 app.command()(check.check)
 app.command()(deploy.deploy)
+app.command()(bags.record)
+app.command()(bags.replay)
 app.command()(sim.sim)

@@ -1,0 +1,100 @@
+"""gym-mara identify: the physical parameters of an arm, from a bag of its motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from gym_mara.cli.common import (
+    SetOption,
+    backend_name,
+    err,
+    keyword_arguments,
+    names_in,
+    number,
+    one_of,
+    out,
+    several,
+)
+from gym_mara.cli.ros2.options import CommandTopicOption, StateTopicOption
+from gym_mara.errors import GymMaraError
+from gym_mara.files import write_json
+from gym_mara.identification.fit import identify as fit
+from gym_mara.identification.identified import Identified
+from gym_mara.identification.parameters import DEFAULT, PRIORS
+from gym_mara.robot import RobotModel
+
+_DEFAULT = [",".join(DEFAULT)]
+
+
+def identify(
+    bag: Annotated[
+        Path,
+        typer.Argument(help="Folder of a bag, with joint states and commands of a moving arm."),
+    ],
+    robot: Annotated[str, typer.Option(help="Its robot: a name, or a URDF.")] = "mara",
+    backend: Annotated[
+        str,
+        typer.Option(parser=backend_name, metavar="NAME", help="Backend with dynamics."),
+    ] = "dart",
+    out_file: Annotated[
+        Path | None, typer.Option("--out", help="New JSON file for the parameters and ranges.")
+    ] = None,
+    parameters: Annotated[
+        list[str],
+        typer.Option(
+            parser=several(one_of("parameter", lambda: PRIORS)),
+            metavar="NAMES",
+            help=f"What is identified: {', '.join(PRIORS)}.",
+        ),
+    ] = _DEFAULT,
+    period: Annotated[
+        float,
+        typer.Option(parser=number(1e-3, 1.0), metavar="X", help="Control period, s."),
+    ] = 0.02,
+    command_topic: CommandTopicOption = None,
+    state_topic: StateTopicOption = None,
+    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+) -> None:
+    """Find the delay, servo gains, effort limits and friction with which a backend follows a real arm best.
+
+    The result has ranges for the keyword randomisation. Needs the extra ros2, and that of the backend.
+    """
+    from gym_mara.ros2.logs import STATES, read_log  # rosbags is optional
+
+    if out_file is not None and out_file.exists():
+        raise GymMaraError(f"{str(out_file)!r} exists and is not overwritten: delete it first")
+    arm = RobotModel.load(robot)
+    log = read_log(bag, arm, period, states=state_topic or STATES, commands=command_topic)
+    err.print(f"{log.duration:.1f} s of {arm.name}; this takes some minutes", highlight=False)
+    chosen = names_in("--parameters", parameters)
+    found = fit(log, arm, backend, chosen, **keyword_arguments(settings))
+    _print(found)
+    if out_file is not None:
+        write_json(out_file, found.to_json(), new=True)
+
+
+def _print(found: Identified) -> None:
+    table = Table("parameter", "joint", "value", "range", title=f"{found.robot} on {found.backend}")
+    for each in found.estimates:
+        known = each.undetermined is None
+        table.add_row(
+            each.name,
+            each.joint or "",
+            f"{each.value:.4g}" if known else "",
+            f"{each.low:.4g} to {each.high:.4g}"
+            if known
+            else f"not determined: {each.undetermined}",
+        )
+    out.print(table)
+    table = Table("joint", "error before", "error now", title="Errors, root mean square, rad (m)")
+    for joint, error in found.error.items():
+        table.add_row(joint, f"{found.error_before[joint]:.2g}", f"{error:.2g}")
+    out.print(table)
+    ranges = ", ".join(
+        f"'{name}': ({low:.4g}, {high:.4g})" for name, (low, high) in found.randomisation.items()
+    )
+    out.print(f"randomisation={{{ranges}}}", highlight=False)

@@ -1,0 +1,72 @@
+"""gym-mara ros2 record and replay: bags of an arm's topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from gym_mara.cli.common import err, number, out
+from gym_mara.cli.ros2.options import DomainOption
+from gym_mara.errors import GymMaraError
+
+
+def record(
+    bag: Annotated[Path, typer.Argument(help="New folder for the bag.")],
+    topic: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME",
+            help="Topic to record; by default all with joint states, commands, targets or diagnostics.",
+        ),
+    ] = [],  # noqa: B006 - Typer reads it and never changes it
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            parser=number(0.1, 1e6),
+            metavar="X",
+            help="How long from the first message on, s; by default until Ctrl-C.",
+        ),
+    ] = None,
+    domain: DomainOption = None,
+) -> None:
+    """Record the topics of an arm as a bag in MCAP, which the tools of ROS can read.
+
+    After a kill the bag can still be read, but for about the last second. Needs the extra ros2.
+    """
+    from gym_mara.ros2.recording import record as run
+
+    err.print("Recording; stop with Ctrl-C.")
+    counts = run(bag, topic, seconds, domain=domain)
+    _print(f"Recorded in {bag}", counts)
+    if not counts:
+        raise GymMaraError(
+            f"no messages came: {str(bag)!r} is empty; is the arm there, and in the same ROS_DOMAIN_ID?"
+        )
+
+
+def replay(
+    bag: Annotated[Path, typer.Argument(help="Folder of a bag.")],
+    rate: Annotated[
+        float, typer.Option(parser=number(0.01, 100.0), metavar="X", help="Times as fast.")
+    ] = 1.0,
+    domain: DomainOption = None,
+) -> None:
+    """Publish the states, commands and targets of a bag on the topics /replay/…, for looking at them.
+
+    No arm is moved. Needs the extra ros2.
+    """
+    from gym_mara.ros2.recording import PREFIX
+    from gym_mara.ros2.recording import replay as run
+
+    err.print(f"Replaying on {PREFIX}/…, which no arm listens to.")
+    _print(f"Replayed from {bag}", run(bag, rate, domain=domain))
+
+
+def _print(title: str, counts: dict[str, int]) -> None:
+    table = Table("topic", "messages", title=title)
+    for topic, count in sorted(counts.items()):
+        table.add_row(topic, f"{count:,}")
+    out.print(table)
