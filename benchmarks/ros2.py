@@ -28,8 +28,8 @@ from gym_mara.pretrained import pretrained_file
 from gym_mara.robot import RobotModel
 from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.ros2.arm import ArmState
-from gym_mara.ros2.motion import MotionLimits
-from gym_mara.ros2.safety import Mode, SafetyFilter
+from gym_mara.ros2.safety.filter import Mode, SafetyFilter
+from gym_mara.ros2.safety.motion import MotionLimits
 
 if TYPE_CHECKING:
     from gym_mara.ros2.deploy import Deployment

@@ -13,8 +13,8 @@ from gym_mara.errors import GymMaraError, flag, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError, Driver
-from gym_mara.ros2.motion import MotionLimits
-from gym_mara.ros2.safety import SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.filter import SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.motion import MotionLimits
 from gym_mara.state import SimState
 from gym_mara.types import Floats, Mask
 

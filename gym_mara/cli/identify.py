@@ -63,7 +63,7 @@ def identify(
 
     The result has ranges for the keyword randomisation. Needs the extra ros2, and that of the backend.
     """
-    from gym_mara.ros2.logs import STATES, read_log  # rosbags is optional
+    from gym_mara.ros2.bags.logs import STATES, read_log  # rosbags is optional
 
     if out_file is not None and out_file.exists():
         raise GymMaraError(f"{str(out_file)!r} exists and is not overwritten: delete it first")

@@ -11,7 +11,7 @@ import numpy as np
 
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.arm import ArmState, Clock, Link, Setpoint
-from gym_mara.ros2.safety import Mode, SafetyFilter
+from gym_mara.ros2.safety.filter import Mode, SafetyFilter
 from gym_mara.types import Floats
 
 _WINDOW = 1000

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.node import needs_ros
-from gym_mara.ros2.trajectories import Point
+from gym_mara.ros2.sim.trajectories import Point
 from gym_mara.types import Floats
 
 with needs_ros("ROS 2"):

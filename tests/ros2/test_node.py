@@ -108,7 +108,7 @@ import sys
 for name in ("rclpy", "sensor_msgs"):
     sys.modules[name] = None
 import gym_mara, gym_mara.cli.app
-import gym_mara.ros2.profiles, gym_mara.ros2.joints, gym_mara.ros2.simulated_arm
+import gym_mara.ros2.profiles, gym_mara.ros2.joints, gym_mara.ros2.sim.arm
 try:
     import gym_mara.ros2.link
 except ImportError as error:

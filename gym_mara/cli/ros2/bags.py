@@ -36,7 +36,7 @@ def record(
 
     After a kill the bag can still be read, but for about the last second. Needs the extra ros2.
     """
-    from gym_mara.ros2.recording import record as run
+    from gym_mara.ros2.bags.recording import record as run
 
     err.print("Recording; stop with Ctrl-C.")
     counts = run(bag, topic, seconds, domain=domain)
@@ -58,8 +58,8 @@ def replay(
 
     No arm is moved. Needs the extra ros2.
     """
-    from gym_mara.ros2.recording import PREFIX
-    from gym_mara.ros2.recording import replay as run
+    from gym_mara.ros2.bags.recording import PREFIX
+    from gym_mara.ros2.bags.recording import replay as run
 
     err.print(f"Replaying on {PREFIX}/…, which no arm listens to.")
     _print(f"Replayed from {bag}", run(bag, rate, domain=domain))

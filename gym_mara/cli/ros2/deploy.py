@@ -91,7 +91,7 @@ def deploy(
     with _exported(policy, env) as exported:
         from gym_mara.ros2.deploy import Deployment
         from gym_mara.ros2.deploy_node import RESUME, STOP, TARGET, DeployNode
-        from gym_mara.ros2.safety import NO_EMERGENCY_STOP
+        from gym_mara.ros2.safety.filter import NO_EMERGENCY_STOP
 
         deployment = Deployment(exported, env, options, _note)
         try:

@@ -57,8 +57,8 @@ def sim(
     joint_trajectory_controller, of a forward_position_controller and of gym-gazebo2's MARA, and has the service ~/reset. Needs
     the extra ros2.
     """
-    from gym_mara.ros2.sim import SimNode
-    from gym_mara.ros2.simulated_arm import SimulatedArm
+    from gym_mara.ros2.sim.arm import SimulatedArm
+    from gym_mara.ros2.sim.node import SimNode
 
     options = keyword_arguments(settings)
     of_robot: dict[str, Any] = {

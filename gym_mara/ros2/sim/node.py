@@ -9,7 +9,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.ros2 import messages
 from gym_mara.ros2.arm import Clock, WallClock
 from gym_mara.ros2.node import RosNode, needs_ros
-from gym_mara.ros2.simulated_arm import Pace, SimulatedArm
+from gym_mara.ros2.sim.arm import Pace, SimulatedArm
 from gym_mara.state import Contact, SimState
 
 with needs_ros("a simulated arm"):
@@ -84,7 +84,7 @@ class SimNode:
         self._actions: Any = None
         self._mara_states: Any = None
         if messages.control_msgs_installed():
-            from gym_mara.ros2.follow_action import FollowAction
+            from gym_mara.ros2.sim.follow_action import FollowAction
 
             self._actions = FollowAction(node, ACTION, arm, self.delay_of)
             kind = messages.controller_state_type()

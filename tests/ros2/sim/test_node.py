@@ -23,11 +23,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from gym_mara.backends import make_backend
 from gym_mara.robot import RobotModel
-from gym_mara.ros2 import messages, sim
+from gym_mara.ros2 import messages
 from gym_mara.ros2.arm import Setpoint
 from gym_mara.ros2.link import RosLink
-from gym_mara.ros2.sim import SimNode
-from gym_mara.ros2.simulated_arm import SimulatedArm
+from gym_mara.ros2.sim import node as sim
+from gym_mara.ros2.sim.arm import SimulatedArm
+from gym_mara.ros2.sim.node import SimNode
 from tests.helpers import robot_model
 from tests.ros2.peers import Peer, eventually
 

@@ -9,8 +9,8 @@ from gym_mara.collision import CollisionChecker, make_checker
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.collision.free_poses import FreePoses
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.motion import Motion, MotionLimits
-from gym_mara.ros2.paths import PathChecker, free_move
+from gym_mara.ros2.safety.motion import Motion, MotionLimits
+from gym_mara.ros2.safety.paths import PathChecker, free_move
 from gym_mara.testing import COLLIDING_Q
 from tests.helpers import PATH_ENDS, Floats, Mask, robot_model
 

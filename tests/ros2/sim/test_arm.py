@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from gym_mara.backends import make_backend
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.simulated_arm import DONE, REPLACED, RUNNING, Pace, SimulatedArm
-from gym_mara.ros2.trajectories import Point
+from gym_mara.ros2.sim.arm import DONE, REPLACED, RUNNING, Pace, SimulatedArm
+from gym_mara.ros2.sim.trajectories import Point
 from gym_mara.types import Floats
 from tests.helpers import robot_model
 

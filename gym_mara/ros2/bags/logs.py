@@ -14,7 +14,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.identification.log import Log
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.bags import Bag, Message, Recorder
+from gym_mara.ros2.bags.bag import Bag, Message, Recorder
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:

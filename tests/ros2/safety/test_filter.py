@@ -11,10 +11,10 @@ import pytest
 from gym_mara.collision import CollisionChecker, make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.safety import RAMP_START, Mode
+from gym_mara.ros2.safety.filter import RAMP_START, Mode
 from gym_mara.testing import COLLIDING_Q
 from tests.helpers import PATH_ENDS, Floats, Mask, joint_xml, urdf_xml, write
-from tests.ros2.arms import PERIOD, Arm, in_motion, state_of
+from tests.ros2.safety.arms import PERIOD, Arm, in_motion, state_of
 
 
 def test_a_reachable_command_is_reached_exactly_and_held(mara: RobotModel) -> None:

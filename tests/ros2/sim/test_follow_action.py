@@ -13,9 +13,10 @@ import numpy as np
 
 from gym_mara.backends import make_backend
 from gym_mara.robot import RobotModel
-from gym_mara.ros2 import follow_action, messages
-from gym_mara.ros2.follow_action import FollowAction
-from gym_mara.ros2.simulated_arm import SimulatedArm
+from gym_mara.ros2 import messages
+from gym_mara.ros2.sim import follow_action
+from gym_mara.ros2.sim.arm import SimulatedArm
+from gym_mara.ros2.sim.follow_action import FollowAction
 
 
 class Result:

@@ -9,8 +9,8 @@ import numpy as np
 from gym_mara.collision import CollisionChecker
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Setpoint
-from gym_mara.ros2.motion import MotionLimits
-from gym_mara.ros2.safety import Mode, SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.filter import Mode, SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.motion import MotionLimits
 from tests.helpers import Floats
 
 PERIOD = 0.01

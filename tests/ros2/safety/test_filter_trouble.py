@@ -10,8 +10,8 @@ import pytest
 
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.safety import Mode
-from tests.ros2.arms import Arm, in_motion, state_of
+from gym_mara.ros2.safety.filter import Mode
+from tests.ros2.safety.arms import Arm, in_motion, state_of
 
 NO_COMMANDS: dict[str, tuple[Any, str]] = {
     "nan": (

@@ -9,7 +9,7 @@ import numpy as np
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.motion import Motion
+from gym_mara.ros2.safety.motion import Motion
 from gym_mara.types import Floats
 
 RESOLUTION = 0.005

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gym_mara.errors import GymMaraError
-from gym_mara.ros2.trajectories import Path, Point, Trajectory
+from gym_mara.ros2.sim.trajectories import Path, Point, Trajectory
 
 NAMES = ("a", "b")
 

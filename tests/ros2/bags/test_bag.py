@@ -17,9 +17,9 @@ from gym_mara.errors import GymMaraError
 from gym_mara.files import DamagedFileError, MissingFileError
 from gym_mara.identification import Log
 from gym_mara.robot import RobotModel
-from gym_mara.ros2 import bags
-from gym_mara.ros2.bags import Bag, Recorder
-from gym_mara.ros2.logs import read_log, write_episode
+from gym_mara.ros2.bags import bag as bags
+from gym_mara.ros2.bags.bag import Bag, Recorder
+from gym_mara.ros2.bags.logs import read_log, write_episode
 
 
 def some_log(robot: RobotModel, ticks: int = 120) -> Log:

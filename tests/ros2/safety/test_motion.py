@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.motion import (
+from gym_mara.ros2.safety.motion import (
     ACCELERATION_TIME,
     VELOCITY_TIME,
     Motion,
     MotionLimits,
 )
-from gym_mara.ros2.planners import NoTrajectoryError
+from gym_mara.ros2.safety.planners import NoTrajectoryError
 from tests.helpers import Floats, joint_xml, robot_model, urdf_xml, write
 
 PERIOD = 0.01
@@ -178,6 +178,6 @@ def test_a_target_that_is_no_number_has_no_trajectory(mara: RobotModel) -> None:
 
 def test_without_ruckig_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ruckig", None)
-    monkeypatch.delitem(sys.modules, "gym_mara.ros2.planners")
+    monkeypatch.delitem(sys.modules, "gym_mara.ros2.safety.planners")
     with pytest.raises(MissingExtraError, match=r"safety filter needs ruckig.*gym_mara\[ros2\]"):
-        import gym_mara.ros2.planners  # noqa: F401
+        import gym_mara.ros2.safety.planners  # noqa: F401

@@ -14,10 +14,10 @@ from gym_mara.collision.coal import CoalChecker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Setpoint
-from gym_mara.ros2.motion import MotionLimits
-from gym_mara.ros2.safety import Mode, SafetyFilter
+from gym_mara.ros2.safety.filter import Mode, SafetyFilter
+from gym_mara.ros2.safety.motion import MotionLimits
 from tests.helpers import Floats, robot_model
-from tests.ros2.arms import LONGEST_STOP, state_of
+from tests.ros2.safety.arms import LONGEST_STOP, state_of
 
 EVENTS = (
     *("go", "near", "flip", "into") * 3,

@@ -12,11 +12,11 @@ from gym_mara.collision import make_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState
-from gym_mara.ros2.motion import MotionLimits
-from gym_mara.ros2.safety import Mode, SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.filter import Mode, SafetyFilter, Watchdogs
+from gym_mara.ros2.safety.motion import MotionLimits
 from gym_mara.testing import COLLIDING_Q
 from tests.helpers import robot_model
-from tests.ros2.arms import PERIOD, Arm, state_of
+from tests.ros2.safety.arms import PERIOD, Arm, state_of
 
 
 def _refusals(mara: RobotModel) -> list[tuple[ArmState | None, str]]:

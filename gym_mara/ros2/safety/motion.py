@@ -13,7 +13,14 @@ import numpy as np
 from gym_mara.backends.base import limited_velocity
 from gym_mara.errors import LARGEST, GymMaraError, finite_numbers, positive_number
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.planners import JointPlanner, LinePlanner, Numbers, Planner, State, StopPlanner
+from gym_mara.ros2.safety.planners import (
+    JointPlanner,
+    LinePlanner,
+    Numbers,
+    Planner,
+    State,
+    StopPlanner,
+)
 from gym_mara.types import Floats
 
 VELOCITY_TIME = 0.2

@@ -17,9 +17,9 @@ from gym_mara.collision.base import CollisionChecker
 from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Setpoint
-from gym_mara.ros2.motion import Motion, MotionLimits
-from gym_mara.ros2.paths import PathChecker
-from gym_mara.ros2.watchdogs import Guard, Watchdogs, too_old, wrong_clock
+from gym_mara.ros2.safety.motion import Motion, MotionLimits
+from gym_mara.ros2.safety.paths import PathChecker
+from gym_mara.ros2.safety.watchdogs import Guard, Watchdogs, too_old, wrong_clock
 from gym_mara.types import Floats
 
 __all__ = ["NO_EMERGENCY_STOP", "Mode", "SafetyFilter", "Watchdogs"]

@@ -21,11 +21,11 @@ from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.identification import Log
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.bags import Recorder
-from gym_mara.ros2.logs import COMMANDS, STATES, episode, read_log, write_episode
+from gym_mara.ros2.bags.bag import Recorder
+from gym_mara.ros2.bags.logs import COMMANDS, STATES, episode, read_log, write_episode
 from gym_mara.types import Floats
 from tests.helpers import Cli, robot_model
-from tests.ros2.test_bags import some_log
+from tests.ros2.bags.test_bag import some_log
 
 NONE = np.zeros(0)
 PERIOD = 20_000_000

@@ -8,7 +8,7 @@ from typing import Any
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2 import messages
 from gym_mara.ros2.node import needs_ros
-from gym_mara.ros2.simulated_arm import DONE, RUNNING, SimulatedArm
+from gym_mara.ros2.sim.arm import DONE, RUNNING, SimulatedArm
 
 with needs_ros("the action FollowJointTrajectory"):
     from rclpy.action import ActionServer, CancelResponse, GoalResponse

@@ -12,7 +12,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from gym_mara.errors import GymMaraError
-from gym_mara.ros2.bags import Bag, Recorder
+from gym_mara.ros2.bags.bag import Bag, Recorder
 from gym_mara.ros2.link import DISCOVERY
 from gym_mara.ros2.node import RosNode, needs_ros
 

@@ -15,8 +15,8 @@ pytest.importorskip("rclpy")
 pytest.importorskip("rosbags")
 
 from gym_mara.errors import GymMaraError
-from gym_mara.ros2 import recording
-from gym_mara.ros2.bags import Bag
+from gym_mara.ros2.bags import recording
+from gym_mara.ros2.bags.bag import Bag
 from tests.helpers import Cli, started
 
 pytestmark = pytest.mark.slow

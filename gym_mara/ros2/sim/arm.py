@@ -10,7 +10,7 @@ import numpy as np
 from gym_mara.backends import Backend
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.arm import Clock
-from gym_mara.ros2.trajectories import Path, Point, Trajectory, row
+from gym_mara.ros2.sim.trajectories import Path, Point, Trajectory, row
 from gym_mara.state import SimState
 from gym_mara.types import Floats
 

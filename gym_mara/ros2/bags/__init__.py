@@ -1,0 +1,1 @@
+"""Bags: recorded, replayed, and turned into logs and episodes."""
