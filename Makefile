@@ -36,8 +36,8 @@ experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four en
 test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and commands with the oldest supported Gymnasium.
 	.venv-oldest/bin/python -m pytest -n auto -m "not slow and not nightly" $(GYMNASIUM_TESTS)
 
-test-kilted: .venv-kilted/.ready ## Run the tests with ROS 2 with the wheels of Kilted; all others use those of Jazzy.
-	.venv-kilted/bin/python -m pytest -n auto -m "not nightly" tests/ros2
+test-kilted: .venv-kilted/.ready ## Run the tests that speak ROS 2 with the wheels of Kilted; all others use those of Jazzy.
+	.venv-kilted/bin/python -m pytest -n auto -m "not nightly" $(ROS_TESTS)
 
 test-rllib: .venv-rllib/.ready ## Run the RLlib example, which pins an older Gymnasium, with that one.
 	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
@@ -53,6 +53,8 @@ EXTRAS ?= dev
 TESTS ?=
 # Another Gymnasium changes nothing in these.
 OTHER_TESTS = $(patsubst %,tests/test_%.py,benchmark_reach cli_fuzz cli_process cli_robot docs errors examples files package rotations snapshots)
+# The others need no ROS.
+ROS_TESTS = $(addprefix tests/ros2/,sim bags/test_recording.py test_check.py test_faults.py test_link.py test_node.py)
 GYMNASIUM_TESTS = $(filter-out $(OTHER_TESTS),$(wildcard tests/test_*.py)) tests/envs tests/rendering/test_pictures.py tests/agents/test_sb3.py
 
 $(READY): pyproject.toml $(CONSTRAINTS)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "gpu.py"
 
@@ -18,6 +17,7 @@ def _done(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.nightly
 def test_every_measurement_is_made_and_written_though_others_fail(tmp_path: Path) -> None:
     file = tmp_path / "gpu.md"
     small = ["--device", "cpu", "--arms", "0", "2", "2", "--training-arms", "2", "--seconds", "0.1"]
@@ -32,6 +32,7 @@ def test_every_measurement_is_made_and_written_though_others_fail(tmp_path: Path
     assert ("dynamics", "2", "relative to the bare graph") in measured
 
 
+@pytest.mark.slow
 def test_without_a_gpu_it_says_so() -> None:
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():

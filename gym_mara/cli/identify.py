@@ -28,6 +28,8 @@ from gym_mara.identification.parameters import DEFAULT, PRIORS
 from gym_mara.robot import RobotModel
 
 _DEFAULT = [",".join(DEFAULT)]
+_LARGE = 5e-3
+"""An error from which on the parameters are doubtful, rad (m)."""
 
 
 def identify(
@@ -94,6 +96,12 @@ def _print(found: Identified) -> None:
     for joint, error in found.error.items():
         table.add_row(joint, f"{found.error_before[joint]:.2g}", f"{error:.2g}")
     out.print(table)
+    if max(found.error.values()) > _LARGE:
+        out.print(
+            f"note: an error of more than {_LARGE:g} rad (m) is left. The backend does not follow this arm, or the search ended in a "
+            "false minimum: do not trust the values, and record another motion.",
+            soft_wrap=True,
+        )
     ranges = ", ".join(
         f"'{name}': ({low:.4g}, {high:.4g})" for name, (low, high) in found.randomisation.items()
     )
