@@ -102,7 +102,6 @@ class Ros2Backend(Backend):
         """Moves the arm."""
         self._began = self._due = self.clock.now()
         self._lateness = self._missed = 0.0
-        self._collided = False
         try:
             self.driver.start(thread=self._in_thread)
         except BaseException:
@@ -124,9 +123,7 @@ class Ros2Backend(Backend):
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
         if mask is not None and not mask[0]:
             return
-        if self._collided:
-            self._collided = False
-            self.driver.resume()
+        self.driver.resume_if_blocked()
         self.driver.check()
         if self.driver.live:
             self._move_to(q[0])
@@ -149,6 +146,11 @@ class Ros2Backend(Backend):
             self.driver.safety.speed = _RESET_SPEED
             try:
                 self._wait_at(goal)
+            except ArmStoppedError:
+                raise
+            except BaseException:
+                self.driver.stop("the motion to the start pose was interrupted")
+                raise
             finally:
                 self.driver.safety.speed = 1.0
 
@@ -181,7 +183,7 @@ class Ros2Backend(Backend):
         except ArmStoppedError:
             if not self.driver.safety.blocked:
                 raise
-            self._collided = True
+            self.clock.sleep_until(self._due)
         return self.state
 
     def _reported(self) -> ArmState:
@@ -207,7 +209,7 @@ class Ros2Backend(Backend):
             ee_position=position,
             ee_quaternion=quaternion,
             ee_velocity=self._kinematics.velocity(q, qd),
-            collided=self._checker.check(q) | self._collided,
+            collided=self._checker.check(q) | self.driver.safety.blocked,
             time=np.array([now - self._began]),
             torque=None if reported.effort is None else reported.effort[None].copy(),
             timing={name: np.array([value]) for name, value in timing.items()},

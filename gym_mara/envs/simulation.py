@@ -50,6 +50,14 @@ class Simulation:
         self.options = options
         self.backend_name = options.backend
         self.backend = make_backend(options.backend, self.robot, self.num_envs, options.settings)
+        try:
+            self._prepare(options)
+        except BaseException:
+            self.backend.close()  # it may move an arm
+            raise
+
+    def _prepare(self, options: Options) -> None:
+        """Make what the task and the actions need, for the backend's arms."""
         asarray = self.backend.asarray
         self.episodes = Episodes(self.task, self.robot, self.num_envs, asarray)
         """The start and the goal of each arm."""

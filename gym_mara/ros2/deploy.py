@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,12 +17,17 @@ from gym_mara.envs.given import Given
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError
-from gym_mara.ros2.driver import ArmStoppedError, Timing
+from gym_mara.ros2.diagnostics import Diagnostics
+from gym_mara.ros2.driver import ArmStoppedError
+from gym_mara.ros2.safety import Mode
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:
+    from gym_mara.ros2.link import RosLink
     from gym_mara.ros2.node import RosNode
 
+_WINDOW = 1000
+"""Over how many of the last actions their lateness is measured."""
 _WAIT = 0.05
 """How often a deployment that waits looks for a target or a resume, s."""
 
@@ -35,48 +41,6 @@ class Target(NamedTuple):
     """(4,), [w, x, y, z]; None for a position alone."""
 
 
-class Diagnostics(NamedTuple):
-    """What a deployment reports about itself."""
-
-    status: str
-    """What the arm does: "waits for a target", "moves", or why it has stopped."""
-    steps: int
-    missed_ticks: int
-    """Of the policy, control periods."""
-    lateness: tuple[float, float]
-    """How long after its tick an action came, s: the median and the 99th percentile of the last actions."""
-    state_age: float
-    """Of the last state, s."""
-    refused: dict[str, int]
-    """How many messages of the arm were refused, by reason."""
-    setpoints: Timing
-    """Of the thread that sends set-points."""
-    error: float | None
-    """The distance to the target, m; None where there is none yet."""
-
-    def rows(self) -> list[tuple[str, str]]:
-        """The figures with their names, as text."""
-        late, ticks = self.lateness, self.setpoints
-        refused = ", ".join(f"{reason} {count}" for reason, count in self.refused.items())
-        return [
-            (
-                "distance to the target, mm",
-                "-" if self.error is None else f"{1e3 * self.error:.3f}",
-            ),
-            ("actions", f"{self.steps:,}"),
-            ("missed control periods", f"{self.missed_ticks:,}"),
-            ("lateness of actions, p50 and p99, ms", f"{1e3 * late[0]:.2f}, {1e3 * late[1]:.2f}"),
-            ("set-points", f"{ticks.ticks:,}"),
-            ("missed set-points", f"{ticks.missed:,}"),
-            (
-                "jitter of set-points, p50, p99 and largest, ms",
-                ", ".join(f"{1e3 * value:.2f}" for value in ticks.lateness),
-            ),
-            ("age of the arm's state, ms", f"{1e3 * self.state_age:.1f}"),
-            ("refused messages", refused or "none"),
-        ]
-
-
 class Deployment:
     """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target.
 
@@ -84,7 +48,8 @@ class Deployment:
         policy: the policy.
         env: the name of an environment; None for that of the training.
         options: keyword arguments of the environment with the backend "ros2", which replace those of the training.
-        log: is called with a sentence about a refused target and about each stop.
+        log: is called with a sentence about a refused target and about each stop; in a dry run also once a second with what would
+            be sent.
 
     Raises:
         GymMaraError: the policy does not fit the environment, an option is unknown, there is no arm, or it cannot be moved.
@@ -101,26 +66,26 @@ class Deployment:
         self.policy, self._log = policy, log
         keywords = policy.keywords(env, "ros2", **options)
         keywords.setdefault("on_collision", "continue")
+        self._checks = ThreadPoolExecutor(1, "gym_mara targets")
         self._arms = make_vector_env(env or policy.about.env, 1, **keywords)
         self.simulation = simulation = self._arms.simulation
         assert isinstance(simulation.backend, Ros2Backend)
         self.backend: Ros2Backend = simulation.backend
-        self._clock = self.backend.clock
+        self._driver, self._clock = self.backend.driver, self.backend.clock
         simulation.streams = (Streams.of(np.random.default_rng(0)),)
         self.follows = simulation.task.random_goal
         """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
         self.oriented = bool(getattr(simulation.task, "orientation", False))
         """Whether targets have an orientation."""
-        self._workspace = RobotWorkspace(simulation.robot)  # of the thread that checks targets
-        self._checks = ThreadPoolExecutor(1, "gym_mara targets")
+        self._workspace = RobotWorkspace(simulation.robot)  # used by one check at a time
+        self._checking = threading.Lock()
         self._asked: Target | None = None
         self._next: Target | None = None
         self._target: Target | None = None
         self._lock = threading.Lock()
         self._ended = False
         self._steps, self._missed = 0, 0
-        self._lateness: list[float] = []
-        self._status = "waits for a target"
+        self._lateness: deque[float] = deque(maxlen=_WINDOW)
         self._error: float | None = None
         try:
             policy.check(self._arms)
@@ -140,20 +105,29 @@ class Deployment:
         return action
 
     @property
-    def node(self) -> RosNode:
-        """The node of the connection to the arm."""
+    def _link(self) -> RosLink:
         from gym_mara.ros2.link import RosLink  # it imports ROS
 
-        link = self.backend.driver.link
+        link = self._driver.link
         assert isinstance(link, RosLink)
-        return link.node
+        return link
+
+    @property
+    def node(self) -> RosNode:
+        """The node of the connection to the arm."""
+        return self._link.node
+
+    @property
+    def link_notes(self) -> tuple[str, ...]:
+        """What is other with this arm than its profile says."""
+        return self._link.notes
 
     def aim(self, target: Target) -> Future[None]:
         """Reach for a target once it is checked, in a thread of its own: that takes long if it is out of reach. A target that is
         refused changes nothing. It may be called from any thread.
 
         Raises:
-            GymMaraError: the task has a target of its own.
+            GymMaraError: the task has a target of its own, or the deployment is closed.
         """
         if not self.follows:
             raise GymMaraError(
@@ -161,7 +135,10 @@ class Deployment:
             )
         with self._lock:
             self._asked = target
-        return self._checks.submit(self._consider)
+        try:
+            return self._checks.submit(self._consider)
+        except RuntimeError:
+            raise GymMaraError("the deployment has ended, so that it takes no target") from None
 
     def _consider(self) -> None:
         """Check the newest target that is not checked yet."""
@@ -185,11 +162,18 @@ class Deployment:
         """
         simulation = self.simulation
         one = np.ones(1, np.bool_)
-        Given.of(_as_options(target), simulation.task, simulation.robot, self._workspace, one)
+        with self._checking:
+            Given.of(_as_options(target), simulation.task, simulation.robot, self._workspace, one)
 
     def stop(self, reason: str) -> None:
-        """Decelerate to a hold until `resume`. It may be called from any thread."""
-        self.backend.driver.stop(reason)
+        """Begin to decelerate to a hold until `resume`; return at once. It may be called from any thread.
+
+        Raises:
+            GymMaraError: the driver has failed, and stops nothing.
+        """
+        if self._driver.failure is not None:
+            self._driver.check()
+        self._driver.stop(reason)
 
     def resume(self) -> None:
         """Move again, from where the arm is. It may be called from any thread.
@@ -197,7 +181,7 @@ class Deployment:
         Raises:
             GymMaraError: the arm cannot move from there.
         """
-        self.backend.driver.resume()
+        self._driver.resume()
 
     def end(self) -> None:
         """Let `run` return. It may be called from any thread and by a signal handler."""
@@ -214,11 +198,15 @@ class Deployment:
         """
         end = np.inf if seconds is None else self._clock.now() + seconds
         while not self._over(end):
-            if not self.follows or self._take_target(began=False):
-                self._episode(end)
-            else:
-                self._status = "waits for a target"
-                self._wait()
+            try:
+                self._driver.check()
+                if not self.follows or self._take_target(began=False):
+                    self._episode(end)
+                else:
+                    self._wait()
+            except ArmStoppedError as error:
+                self._log(str(error))
+                self._wait_for_resume(end)
 
     def _over(self, end: float) -> bool:
         return self._ended or self._clock.now() >= end
@@ -237,20 +225,22 @@ class Deployment:
         return self._target is not None
 
     def _episode(self, end: float) -> None:
-        """Play from where the arm is, until a stop or the end."""
-        simulation = self.simulation
-        try:
-            observation = self._begin()
-            self._status = "moves"
-            while not self._over(end):
-                if self.follows:
-                    self._take_target(began=True)
-                outcome = simulation.step(self._act(observation))
-                observation = outcome.observation
-                self._note(outcome.info)
-                self.backend.driver.check()
-        except ArmStoppedError as error:
-            self._wait_for_resume(error, end)
+        """Play from where the arm is until the end.
+
+        Raises:
+            ArmStoppedError: the arm is stopped.
+        """
+        simulation, period = self.simulation, self.backend.control_period
+        observation = self._begin()
+        while not self._over(end):
+            if self.follows:
+                self._take_target(began=True)
+            outcome = simulation.step(self._act(observation))
+            observation = outcome.observation
+            self._note(outcome.info)
+            if not self._driver.live and self._steps % max(1, round(1.0 / period)) == 0:
+                self._log(f"would send: {', '.join(f'{q:.3f}' for q in self._setpoint)} rad (m)")
+            self._driver.check()
 
     def _begin(self) -> Floats:
         """Begin an episode at the measured pose, and return the observation (1, O)."""
@@ -265,40 +255,57 @@ class Deployment:
     def _note(self, info: dict[str, Any]) -> None:
         self._steps += 1
         self._missed += int(info["missed_ticks"][0])
-        self._lateness = [*self._lateness[-999:], float(info["lateness"][0])]
+        self._lateness.append(float(info["lateness"][0]))
         self._error = float(info["distance"][0]) if "distance" in info else None
 
-    def _wait_for_resume(self, error: ArmStoppedError, end: float) -> None:
-        self._log(str(error))
-        self._status = f"stopped: {self.backend.driver.safety.reason}"
+    def _wait_for_resume(self, end: float) -> None:
         while not self._over(end):
             try:
-                self.backend.driver.check()
-                break
+                return self._driver.check()
             except ArmStoppedError:
                 self._wait()
+        return None
+
+    @property
+    def _setpoint(self) -> tuple[float, ...]:
+        setpoint = self._driver.setpoint
+        return () if setpoint is None else tuple(setpoint.q.tolist())
+
+    @property
+    def _status(self) -> tuple[str, bool]:
+        """What the arm does, and whether that is trouble."""
+        safety, failure = self._driver.safety, self._driver.failure
+        if failure is not None:
+            return f"failed: {failure}", True
+        if safety.mode in (Mode.STOPPING, Mode.STOPPED):
+            return f"stopped: {safety.reason}", True
+        if self.follows and self._target is None:
+            return "waits for a target", False
+        return "moves", False
 
     @property
     def diagnostics(self) -> Diagnostics:
         """What the deployment reports now."""
-        link = self.backend.driver.link
         late = np.array(self._lateness or [0.0])
-        state = link.state
+        state = self._driver.link.state
         return Diagnostics(
-            self._status,
+            *self._status,
             self._steps,
             self._missed,
             (float(np.median(late)), float(np.quantile(late, 0.99))),
             np.inf if state is None else self._clock.now() - state.received,
-            dict(link.refused),
-            self.backend.driver.timing,
+            dict(self._driver.link.refused),
+            self._driver.timing,
             self._error,
+            self._setpoint,
         )
 
     def close(self) -> None:
         """Stop the arm, and end the connection."""
-        self._checks.shutdown(cancel_futures=True)
-        self._arms.close()
+        try:
+            self._arms.close()
+        finally:
+            self._checks.shutdown(wait=False, cancel_futures=True)
 
 
 def _as_options(target: Target) -> dict[str, Any]:

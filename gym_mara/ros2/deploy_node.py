@@ -10,7 +10,8 @@ import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers, one_of
 from gym_mara.ros2 import messages
-from gym_mara.ros2.deploy import Deployment, Diagnostics, Target
+from gym_mara.ros2.deploy import Deployment, Target
+from gym_mara.ros2.diagnostics import Diagnostics
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.tasks.reach import check_unit
 
@@ -62,8 +63,11 @@ class DeployNode:
             self._log(str(error))
 
     def _stop(self, _: Any, response: Any) -> Any:
-        self._deployment.stop(f"the service {STOP} was called")
-        response.success, response.message = True, "the arm stops"
+        try:
+            self._deployment.stop(f"the service {STOP} was called")
+            response.success, response.message = True, "the arm stops"
+        except GymMaraError as error:
+            response.success, response.message = False, str(error)
         return response
 
     def _resume(self, _: Any, response: Any) -> Any:
@@ -101,9 +105,8 @@ def _target(pose: Any, frame: pin.SE3, oriented: bool) -> Target:
 
 def _status(found: Diagnostics) -> Any:
     """The diagnostics as a status message."""
-    stopped = found.status.startswith("stopped")
     return DiagnosticStatus(
-        level=DiagnosticStatus.ERROR if stopped else DiagnosticStatus.OK,
+        level=DiagnosticStatus.ERROR if found.in_trouble else DiagnosticStatus.OK,
         name="gym_mara: deploy",
         message=found.status,
         hardware_id="",

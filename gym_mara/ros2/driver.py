@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +15,10 @@ from gym_mara.types import Floats
 
 _WINDOW = 1000
 """Over how many of the last ticks `Driver.timing` is measured."""
-_CLOSING = 3.0
-"""How long `close` waits until the arm has stopped, s."""
+_REPEATED = 0.2
+"""For how long the last set-point of a stop is sent again, s, because messages can be lost."""
+_MARGIN = 1.0
+"""How much longer than a stop `close` and `resume_if_blocked` wait for its end, s."""
 
 
 class ArmStoppedError(GymMaraError):
@@ -38,12 +39,14 @@ class Timing(NamedTuple):
 class Driver:
     """Moves one arm. A thread ticks: it passes the last command through the safety filter and sends the set-point.
 
+    Nothing is sent before the first command and after the end of a stop, so that an arm can be moved by hand or by another program
+    then.
+
     Args:
         link: the connection to the arm.
         safety: the filter; its period is that of the ticks.
         clock: sets the pace.
         live: whether set-points are sent. Without it the filter runs as if the arm followed exactly, and nothing is sent.
-        on_setpoint: is called with each set-point.
     """
 
     def __init__(
@@ -53,10 +56,9 @@ class Driver:
         clock: Clock,
         *,
         live: bool,
-        on_setpoint: Callable[[Setpoint], None] | None = None,
     ) -> None:
         self.link, self.safety, self.live = link, safety, live
-        self._clock, self._on_setpoint = clock, on_setpoint
+        self._clock = clock
         self._lock = threading.RLock()
         self._command: Floats | None = None
         self._commanded = 0.0
@@ -66,6 +68,7 @@ class Driver:
         self._failure: Exception | None = None
         self._ticks = self._missed = 0
         self._late: deque[float] = deque(maxlen=_WINDOW)
+        self._sent_until = -np.inf
 
     def start(self, *, thread: bool = True) -> None:
         """Start at the measured pose.
@@ -89,8 +92,8 @@ class Driver:
         return state
 
     def _hold(self) -> None:
-        """Command the arm to stay where the filter starts it."""
-        self._command, self._commanded = None, self._clock.now()
+        """Forget the last command: the arm stays where the filter has started it."""
+        self._command, self._commanded, self._setpoint = None, self._clock.now(), None
 
     def command(self, q_target: Floats) -> None:
         """Move towards joint targets (J,), rad (m), from the next tick on.
@@ -120,8 +123,13 @@ class Driver:
                 "Driver.resume"
             )
 
+    @property
+    def failure(self) -> Exception | None:
+        """What has ended the thread; None if nothing has."""
+        return self._failure
+
     def stop(self, reason: str) -> None:
-        """Decelerate to a hold, and stay there until `resume`."""
+        """Begin to decelerate to a hold, which lasts until `resume`; return at once."""
         with self._lock:
             self.safety.stop(reason)
 
@@ -137,6 +145,26 @@ class Driver:
             self.safety.resume(self._reported(), self._clock.now())
             self._hold()
 
+    def resume_if_blocked(self) -> None:
+        """Move again after a stop whose only reason is a collision ahead; wait until the arm rests.
+
+        Raises:
+            GymMaraError: as in `resume`.
+        """
+        end = self._clock.now() + self.safety.longest_stop + _MARGIN
+        trouble = GymMaraError("the arm has not come to rest in time")
+        while self.safety.blocked and self._failure is None:
+            with self._lock:
+                if self.safety.blocked and self.safety.mode is Mode.STOPPED:
+                    try:
+                        return self.resume()
+                    except GymMaraError as error:  # it may need a moment to rest
+                        trouble = error
+            if self._clock.now() > end:
+                raise trouble
+            self._clock.sleep_until(self._clock.now() + self.safety.period)
+        return None
+
     @property
     def setpoint(self) -> Setpoint | None:
         """The last set-point; None before the first tick."""
@@ -150,9 +178,9 @@ class Driver:
         return Timing(self._ticks, self._missed, figures)
 
     def tick(self) -> Setpoint:
-        """Pass the last command through the filter, and send the set-point."""
-        now = self._clock.now()
+        """Pass the last command through the safety filter, and send the set-point."""
         with self._lock:
+            now = self._clock.now()
             state = self.link.state
             if not self.live and state is not None and self._setpoint is not None:
                 # Nothing moves, so that the filter sees an arm that follows.
@@ -160,17 +188,17 @@ class Driver:
             setpoint = self.safety.step(now, state, self._command, self._commanded)
             self._setpoint = setpoint
             self._ticks += 1
-        if self.live:
-            self.link.send(setpoint, self.safety.period)
-        if self._on_setpoint is not None:
-            self._on_setpoint(setpoint)
+            if self.safety.mode in (Mode.MOVING, Mode.STOPPING):
+                self._sent_until = now + _REPEATED
+            if self.live and now <= self._sent_until and self.safety.mode is not Mode.WAITING:
+                self.link.send(setpoint, self.safety.period)
         return setpoint
 
     def _run(self) -> None:
         period = self.safety.period
         due = self._clock.now()
         try:
-            while not self._ending:
+            while not (self._ending and self.safety.mode is not Mode.STOPPING):
                 self._late.append(max(0.0, self._clock.now() - due))
                 self.tick()
                 due += period
@@ -183,17 +211,10 @@ class Driver:
             self._failure = error
 
     def close(self) -> None:
-        """Decelerate to a hold, and end. A second call has no effect."""
-        thread, self._thread = self._thread, None
-        if thread is not None:
+        """Decelerate to a hold, and end. A second call has no effect, or waits again if the first was interrupted."""
+        if (thread := self._thread) is not None:
             self.stop("the connection is closed")
-            end = self._clock.now() + _CLOSING
-            while (
-                self.safety.mode is Mode.STOPPING
-                and self._failure is None
-                and self._clock.now() < end
-            ):
-                self._clock.sleep_until(self._clock.now() + self.safety.period)
-            self._ending = True
-            thread.join(_CLOSING)
+            self._ending = True  # the thread ends when the arm has stopped
+            thread.join(self.safety.longest_stop + _MARGIN)
+            self._thread = None
         self.link.close()

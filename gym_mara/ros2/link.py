@@ -15,7 +15,7 @@ from gym_mara.robot import RobotModel
 from gym_mara.ros2 import graph, messages
 from gym_mara.ros2.arm import ArmState, Setpoint
 from gym_mara.ros2.joints import OUT_OF_ORDER, REPEATED, JointMap
-from gym_mara.ros2.node import RosNode, guarded, needs_ros
+from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import Profile, make_profile
 
 with needs_ros("the connection to an arm"):
@@ -24,6 +24,8 @@ with needs_ros("the connection to an arm"):
     from std_msgs.msg import Float64MultiArray
     from trajectory_msgs.msg import JointTrajectory
 
+GOAL = "goal not accepted"
+"""The reason of a refusal by the arm: of a goal of the profile "action"."""
 UNREADABLE = "unreadable"
 """The reason of a refusal: reading the message failed."""
 SILENCE = 1.0
@@ -92,6 +94,7 @@ class RosLink:
         self._publisher: Any = None
         self._client: Any = None
         self._action = action
+        self._commands = commands
         self._connect(commands)
 
     def _connect(self, commands: bool) -> None:
@@ -106,7 +109,7 @@ class RosLink:
         self._subscription = node.create_subscription(
             self.state_type,
             profile.state_topic,
-            guarded(self._on_state, self._on_error),
+            self._hear,
             messages.SENSOR_DATA,
         )
         self._command_type = JointTrajectory
@@ -141,8 +144,16 @@ class RosLink:
         with self._lock:
             return self._map.last_refusal
 
-    def _on_state(self, message: Any) -> None:
-        received = time.monotonic()
+    def _hear(self, message: Any, info: Any) -> None:
+        """Read a state. It was received when the middleware says, however long this thread was held up since."""
+        held_up = max(0.0, 1e-9 * (time.time_ns() - (info["received_timestamp"] or np.inf)))
+        try:
+            self._on_state(message, time.monotonic() - held_up)
+        except Exception as error:  # whatever it is, the thread must go on
+            with self._lock:
+                self._map.refuse(UNREADABLE, f"{type(error).__name__}: {error}")
+
+    def _on_state(self, message: Any, received: float) -> None:
         joints = self.parse(message)
         with self._lock:
             state = self._map.read(
@@ -156,10 +167,6 @@ class RosLink:
             if state is not None:
                 self._state = state
 
-    def _on_error(self, error: Exception) -> None:
-        with self._lock:
-            self._map.refuse(UNREADABLE, f"{type(error).__name__}: {error}")
-
     def send(self, setpoint: Setpoint, period: float) -> None:
         """As in `Link`.
 
@@ -172,7 +179,7 @@ class RosLink:
             raise GymMaraError(
                 f"a set-point must have {shape[0]} finite positions and velocities, not q {q} and qd {qd}; nothing was sent"
             )
-        if self._closed or (self._publisher is None and self._client is None):
+        if self._closed or not self._commands:
             raise GymMaraError(
                 "the link is closed, or was made with commands=False; nothing was sent"
             )
@@ -180,14 +187,20 @@ class RosLink:
         if profile.commands == "positions":
             self._publisher.publish(messages.positions(q))
             return
-        if profile.velocity is not None:
-            qd = np.full(shape, profile.velocity)
+        velocity = None if profile.velocity is None else np.full(shape, profile.velocity)
         names = self.robot.joint_names
-        trajectory = messages.trajectory(names, q, qd, profile.duration(period))
+        trajectory = messages.trajectory(names, q, velocity, profile.duration(period))
         if self._action is None:
             self._publisher.publish(trajectory)
         else:
-            self._client.send_goal_async(self._action.Goal(trajectory=trajectory))
+            goal = self._client.send_goal_async(self._action.Goal(trajectory=trajectory))
+            goal.add_done_callback(self._on_answer)
+
+    def _on_answer(self, goal: Any) -> None:
+        """Count a goal that the arm has refused."""
+        if goal.exception() is not None or not goal.result().accepted:
+            with self._lock:
+                self._map.refuse(GOAL, "the action server did not accept a set-point")
 
     def wait(self, timeout: float) -> None:
         """Wait until the arm has reported a state, and nothing is wrong.

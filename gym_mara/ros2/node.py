@@ -9,7 +9,7 @@ import platform
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -180,20 +180,6 @@ class RosNode:
             self._executor.shutdown(timeout_sec=timeout)
             self.node.destroy_node()
         self.context.try_shutdown()
-
-
-def guarded(
-    callback: Callable[[Any], object], on_error: Callable[[Exception], object]
-) -> Callable[[Any], None]:
-    """A callback whose exceptions are given to another function."""
-
-    def call(message: Any) -> None:
-        try:
-            callback(message)
-        except Exception as error:
-            on_error(error)
-
-    return call
 
 
 def _checked_domain(domain: int | None) -> int | None:

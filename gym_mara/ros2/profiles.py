@@ -40,7 +40,8 @@ class Profile:
     seconds: float | None = None
     """The time_from_start of a point, s; None where `periods` says it."""
     velocity: float | None = None
-    """The velocity of every joint in every point, rad/s; None for the set-point's own."""
+    """The velocity of every joint in every point, rad/s; None for points without velocities: a joint_trajectory_controller refuses a last
+    point with a velocity unless allow_nonzero_velocity_at_trajectory_end is set."""
     best_effort: bool = False
     """Whether commands are published best effort, as sensor data, and not reliably. States are always read best effort, which
     both kinds of publishers can serve."""
@@ -142,9 +143,7 @@ def make_profile(
     speed = form.velocity
     if velocity is not None:
         if speed is None:
-            raise GymMaraError(
-                f"the profile {name!r} commands the velocities of the set-points: leave out velocity"
-            )
+            raise GymMaraError(f"the profile {name!r} commands positions alone: leave out velocity")
         speed = positive_number("velocity", velocity, "rad/s")
     own = usual if controller is None else controller
     state = f"{own}/{form.state_topic}" if form.states == "controller_state" else form.state_topic

@@ -11,12 +11,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from gym_mara.backends import backend_names, make_backend, simulated_backends
+from gym_mara.backends import backend_names, make_backend, registry, simulated_backends
+from gym_mara.envs import make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
+from gym_mara.ros2.arm import Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError
 from tests.helpers import PATH_ENDS
-from tests.ros2.fake import FakeRos2Backend
+from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend
 
 Make = Callable[..., FakeRos2Backend]
 
@@ -115,11 +117,108 @@ def test_a_collision_ahead_stops_the_arm_and_the_next_reset_resumes_it(robot: Ro
         if state.collided[0]:
             break
     assert state.collided[0]
+    before = backend.clock.now()
+    backend.step(np.array([PATH_ENDS[1]]))
+    assert backend.clock.now() == pytest.approx(before + backend.control_period), "in its time"
     assert not backend._checker.check(backend.state.q)[0], "it stops before the obstacle"
-    backend.clock.pass_by(1.0)
     backend.reset(backend.state.q)
     assert not backend.state.collided[0]
     backend.step(np.array([PATH_ENDS[0]]))
+
+
+@pytest.mark.parametrize("on_collision", ["reset", "terminate"])
+def test_an_environment_goes_on_after_a_collision_ahead(
+    on_collision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(registry._BACKENDS, "ros2", "tests.ros2.fake:FakeRos2Backend")
+    keywords = {"live": True, "on_collision": on_collision, "command_age": 5.0, "backend": "ros2"}
+    envs = make_vector_env("MARA-v0", 1, start_q=PATH_ENDS[0], **keywords)
+    envs.reset(seed=0)
+    collisions = 0
+    for _ in range(600):
+        *_, infos = envs.step(np.array([PATH_ENDS[1]], np.float32))
+        collisions += int(infos["collided"][0])
+    assert collisions >= 2
+    envs.close()
+
+
+def test_a_reset_never_ends_the_stop_of_an_operator(robot: RobotModel) -> None:
+    class There(FakeRos2Backend):
+        start_q = np.array(PATH_ENDS[0])
+
+    backend = There(robot, 1, live=True)
+    backend.reset(backend.state.q)
+    while not backend.state.collided[0]:
+        backend.step(np.array([PATH_ENDS[1]]))
+    backend.driver.stop("the operator's wish")
+    with pytest.raises(ArmStoppedError, match="the operator's wish"):
+        backend.reset(backend.state.q)
+    backend.clock.pass_by(1.0)
+    with pytest.raises(ArmStoppedError, match="the operator's wish"):
+        backend.reset(backend.state.q)
+
+
+def test_an_arm_that_rests_is_told_nothing_and_can_be_moved_by_hand(make: Make) -> None:
+    backend = make()
+    backend.clock.pass_by(1.0)
+    assert not backend.arm.sent, "nothing before the first action"
+    _steps(backend, 20)
+    backend.driver.stop("somebody moves it by hand")
+    backend.clock.pass_by(1.0)
+    backend.arm.sent.clear()
+    backend.arm.q = backend.arm.q + 0.5
+    backend.arm.qd[:] = 0.0
+    backend.clock.pass_by(5.0)
+    assert not backend.arm.sent, "nothing after a stop"
+    backend.driver.resume()
+    backend.reset(backend.state.q)
+    q = backend.state.q
+    state = backend.step(q)
+    np.testing.assert_allclose(state.q, q, atol=1e-9)
+
+
+def test_a_reset_that_is_interrupted_stops_the_arm(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = make()
+    ends = backend.clock.now() + 0.5
+
+    def interrupted(instant: float) -> None:
+        if instant > ends:
+            raise KeyboardInterrupt
+        FakeClock.sleep_until(backend.clock, instant)
+
+    monkeypatch.setattr(backend.clock, "sleep_until", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        backend.reset(backend.state.q + 1.0)
+    monkeypatch.undo()
+    backend.arm.sent.clear()
+    backend.clock.pass_by(2.0)
+    speeds = np.abs([sent.qd for sent in backend.arm.sent])
+    assert speeds.max() <= 0.25 * backend.joint_velocity.max() + 1e-6, "never faster than before"
+    assert not speeds[-1].any()
+    assert "interrupted" in (backend.driver.safety.reason or "")
+
+
+def test_closing_a_moving_arm_brings_it_to_rest(robot: RobotModel) -> None:
+    class InThread(FakeRos2Backend):
+        _in_thread = True
+
+        def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
+            arm, _ = super()._connect(profile, **options)
+            clock = WallClock()
+            assert isinstance(arm, FakeArm)
+            arm.clock = clock  # type: ignore[assignment]
+            return arm, clock
+
+    backend = InThread(robot, 1, live=True, max_joint_acceleration=2.0)
+    backend.reset(backend.state.q)
+    _steps(backend, 20)
+    assert np.abs(backend.arm.qd).max() > 0.1
+    backend.close()
+    assert not backend.arm.qd.any()
+    assert backend.arm.closed
+    backend.close()
 
 
 def test_an_arm_that_falls_silent_stops_and_steps_say_why_until_it_is_resumed(make: Make) -> None:

@@ -113,6 +113,40 @@ def test_a_stop_is_latched_until_the_operator_resumes(deploy: Callable[..., Depl
     assert "somebody asked" in notes[0]
 
 
+def test_a_stop_is_seen_while_it_waits_for_a_target(deploy: Callable[..., Deployment]) -> None:
+    notes: list[str] = []
+    deployment = deploy(notes.append)
+    deployment.run(1.0)
+    deployment.stop("somebody asked")
+    deployment.run(1.0)
+    found = deployment.diagnostics
+    assert (found.status, found.in_trouble) == ("stopped: somebody asked", True)
+    assert "somebody asked" in notes[0]
+    deployment.resume()
+    deployment.aim(NEAR).result()
+    deployment.run(8.0)
+    assert _error(deployment, NEAR) < 1e-4
+
+
+def test_after_a_collision_ahead_the_operator_resumes(
+    deploy: Callable[..., Deployment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deployment = deploy()
+    paths = deployment.backend.driver.safety._paths
+    deployment.aim(NEAR).result()
+    deployment.run(0.7)
+    with monkeypatch.context() as patch:
+        patch.setattr(paths, "first_collision", lambda motion: _arm(deployment).q)
+        deployment.run(0.5)
+    assert deployment.diagnostics.status.startswith("stopped: collision ahead")
+    stopped = _arm(deployment).q.copy()
+    deployment.run(3.0)
+    np.testing.assert_array_equal(_arm(deployment).q, stopped)
+    deployment.resume()
+    deployment.run(8.0)
+    assert _error(deployment, NEAR) < 1e-4
+
+
 def test_an_arm_that_falls_silent_stops_where_it_is(deploy: Callable[..., Deployment]) -> None:
     deployment = deploy()
     deployment.aim(NEAR).result()
@@ -130,10 +164,13 @@ def test_an_arm_that_falls_silent_stops_where_it_is(deploy: Callable[..., Deploy
 
 
 def test_without_live_nothing_is_sent(deploy: Callable[..., Deployment]) -> None:
-    deployment = deploy(live=False)
+    notes: list[str] = []
+    deployment = deploy(notes.append, live=False)
     deployment.aim(NEAR).result()
-    deployment.run(2.0)
+    deployment.run(2.5)
     assert not _arm(deployment).sent
+    assert len(notes) == 2, "once a second"
+    assert all(note.startswith("would send: ") for note in notes)
 
 
 def test_an_end_is_an_end(deploy: Callable[..., Deployment]) -> None:

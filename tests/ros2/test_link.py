@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -116,6 +118,25 @@ def test_an_exception_in_a_callback_is_a_refusal_and_ends_nothing(
     eventually(lambda: link.state is not None and not link.state.q.any())
 
 
+def test_a_state_is_as_old_as_the_middleware_says(
+    links: Callable[..., RosLink], peer: Peer, mara: RobotModel
+) -> None:
+    link, arm = links(mara), Arm(peer)
+    held_up = threading.Event()
+    link.node.node.create_subscription(String, "/hold_up", lambda _: held_up.wait(2.0), 10)
+    eventually(lambda: arm.publish() and link.state is not None)
+    hold_up = peer.publisher(String, "/hold_up")
+    eventually(lambda: hold_up.get_subscription_count())
+    hold_up.publish(String())
+    time.sleep(0.2)
+    before = link.state
+    arm.publish(position=[0.1] * 6)
+    time.sleep(0.5)
+    held_up.set()
+    late = eventually(lambda: link.state is not before and link.state)
+    assert time.monotonic() - late.received > 0.4, "the thread was held up for so long"
+
+
 @pytest.mark.parametrize("name", ["trajectory", "mara-2019"])
 def test_trajectories_are_sent(
     name: str, links: Callable[..., RosLink], peer: Peer, mara: RobotModel
@@ -129,7 +150,7 @@ def test_trajectories_are_sent(
     old = name == "mara-2019"
     assert message.joint_names == NAMES
     assert point.positions.tolist() == Q
-    assert point.velocities.tolist() == ([0.5] * 6 if old else [q / 2.0 for q in Q])
+    assert point.velocities.tolist() == ([0.5] * 6 if old else [])
     assert messages.seconds(point.time_from_start) == pytest.approx(0.001 if old else 0.04)
     assert messages.seconds(message.header.stamp) == 0.0  # so it starts when it arrives
     assert bool(link.notes) == (old and not messages.control_msgs_installed())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 _EVERY = 0.5
 """How often the table is drawn, s."""
+_OPTIONS = {"profile", "controller", "namespace", "domain", "live"}
+"""Settings of the backend that have an option of their own."""
 _TARGET = "X,Y,Z or X,Y,Z,QW,QX,QY,QZ"
 
 
@@ -80,33 +82,38 @@ def deploy(
     Every command passes the safety filter, which replaces no emergency stop. Needs the extras ros2 and deploy.
     """
     first = None if target is None else _parsed(target)
+    given = keyword_arguments(settings)
+    for name in _OPTIONS & given.keys():
+        raise GymMaraError(f"--set {name} has no effect here: give --{name}")
     options = {
+        **given,
         "profile": profile,
         "controller": controller,
         "namespace": namespace,
         "domain": domain,
         "live": live,
-        **keyword_arguments(settings),
     }
     with _exported(policy, env) as exported:
         from gym_mara.ros2.deploy import Deployment
         from gym_mara.ros2.deploy_node import RESUME, STOP, TARGET, DeployNode
         from gym_mara.ros2.safety.filter import NO_EMERGENCY_STOP
 
+        out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
+        if not live:
+            out.print("note: a dry run; nothing is sent without --live.", soft_wrap=True)
         deployment = Deployment(exported, env, options, _note)
-        try:
-            DeployNode(deployment, deployment.node, _note)
+        with _ended_by_signals(deployment.end), closing(deployment):
+            for note in deployment.link_notes:
+                out.print(f"note: {note}.", soft_wrap=True)
             if first is not None:
                 deployment.check(first)
+            DeployNode(deployment, deployment.node, _note)
+            if first is not None:
                 deployment.aim(first)
-            out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
-            if not live:
-                out.print("note: a dry run; nothing is sent without --live.", soft_wrap=True)
             out.print(f"ready: targets on {TARGET}, services {STOP} and {RESUME}", soft_wrap=True)
-            with _ended_by_signals(deployment.end), _table(deployment):
+            out.file.flush()
+            with _table(deployment):
                 deployment.run(seconds)
-        finally:
-            deployment.close()
     for name, value in deployment.diagnostics.rows():
         out.print(f"{name}: {value}", soft_wrap=True)
 

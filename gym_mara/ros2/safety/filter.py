@@ -99,6 +99,10 @@ class SafetyFilter:
         self.mode, self.reason, self.blocked = Mode.WAITING, None, False
         self.clipped = 0
         self._speed = 1.0
+        self.longest_stop = float(
+            (limits.velocity / limits.acceleration + 2.0 * limits.acceleration / limits.jerk).max()
+        )
+        """An upper bound of the time that a stop takes, s."""
         self._motion = Motion(limits, robot.lower, robot.upper, self.period)
         self._paths = None if checker is None else PathChecker(robot, checker, limits.velocity)
         self._started = False
@@ -111,7 +115,7 @@ class SafetyFilter:
     reason: str | None
     """Why it stops or stopped; None while it does not."""
     blocked: bool
-    """Whether it stops or stopped because of a collision ahead: nothing is wrong with the arm then."""
+    """Whether it stops or stopped because of a collision ahead alone: nothing is wrong with the arm then."""
     clipped: int
     """How many commands were cut to the joint limits."""
 
@@ -161,17 +165,24 @@ class SafetyFilter:
             GymMaraError: the arm is not stopped, or the filter cannot start there (see `start`). Nothing has changed then.
         """
         with self._lock:
+            if self.mode is Mode.STOPPING:
+                raise GymMaraError("the arm still decelerates: resume it when it rests")
             if self.mode is not Mode.STOPPED:
                 raise GymMaraError(f"there is no stop to resume from: the arm is {self.mode.value}")
             self._begin(state, now)
 
     def stop(self, reason: str) -> None:
-        """Decelerate the arm to a hold, and hold it until an operator resumes. The first of several reasons stays."""
+        """Begin to decelerate the arm to a hold, which lasts until an operator resumes; return at once.
+
+        The first of several reasons stays, but for a collision ahead, which says less than what comes after it.
+        """
         with self._lock:
             if self.mode in (Mode.WAITING, Mode.MOVING):
                 self.mode, self.reason = Mode.STOPPING, reason
                 if not self._started:  # nothing moves, but a start is refused from now on
                     self.mode = Mode.STOPPED
+            elif self.blocked:
+                self.reason, self.blocked = reason, False
 
     def step(
         self, now: float, state: ArmState | None, command: Floats | None, commanded: float

@@ -99,12 +99,25 @@ def test_a_stop_is_one_and_keeps_its_first_reason(mara: RobotModel) -> None:
     arm.filter.stop("another")
     arm.tick(np.full(6, np.nan), state=None)
     assert arm.filter.reason == "the operator's wish"
-    with pytest.raises(GymMaraError, match="there is no stop to resume from: the arm is stopping"):
+    with pytest.raises(GymMaraError, match="the arm still decelerates"):
         arm.resume()
     arm.until_stopped(mara.home)
     arm.resume()
     with pytest.raises(GymMaraError, match="there is no stop to resume from: the arm is waiting"):
         arm.resume()
+
+
+def test_a_stop_by_somebody_counts_more_than_a_collision_ahead(mara: RobotModel) -> None:
+    arm = Arm(mara, make_checker("coal", mara), q=np.array(PATH_ENDS[0]))
+    while not arm.filter.blocked:
+        arm.tick(np.array(PATH_ENDS[1]))
+    assert "collision ahead" in (arm.filter.reason or "")
+    arm.filter.stop("the operator's wish")
+    assert (arm.filter.reason, arm.filter.blocked) == ("the operator's wish", False)
+    arm.until_stopped()
+    arm.resume()
+    arm.filter.stop("again")
+    assert not arm.filter.blocked
 
 
 def test_it_resumes_from_the_measured_pose(mara: RobotModel) -> None:
