@@ -119,7 +119,7 @@ class Deployment:
 
     @property
     def link_notes(self) -> tuple[str, ...]:
-        """What is other with this arm than its profile says."""
+        """In what the connection to the arm differs from its profile."""
         return self._link.notes
 
     def aim(self, target: Target) -> Future[None]:

@@ -66,7 +66,7 @@ class JointMap:
         self.refused: Counter[str] = Counter()
         """How many states were refused, by reason."""
         self.last_refusal: str | None = None
-        """Why the last one was refused that was refused, with the details."""
+        """The reason of the last refusal, with the details."""
         margin = np.where(robot.kinematics().prismatic, LIMIT_MARGIN[1], LIMIT_MARGIN[0])
         self._lower, self._upper = robot.lower - margin, robot.upper + margin
         self._limits = robot.lower, robot.upper

@@ -74,7 +74,7 @@ class RosLink:
             own = make_profile(own, controller=controller, namespace=namespace)
         own.check(robot.joint_names)
         self.notes: tuple[str, ...] = ()
-        """What is other than the profile says."""
+        """In what the connection differs from its profile."""
         if own.states == "controller_state" and not messages.control_msgs_installed():
             replaced = own.with_joint_states()
             self.notes = (
@@ -140,7 +140,7 @@ class RosLink:
 
     @property
     def last_refusal(self) -> str | None:
-        """Why the last state was refused that was refused; None if none was."""
+        """The reason of the last refusal of a state; None without one."""
         with self._lock:
             return self._map.last_refusal
 

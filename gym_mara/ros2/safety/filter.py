@@ -56,9 +56,9 @@ class SafetyFilter:
 
     From each set-point a stop that keeps the limits of acceleration and jerk is known. It stays within the joint limits, and neither
     it nor the way to the set-point collides. A set-point without one is refused: the arm follows the last stop, and the stop is
-    latched. So are a command that is no J finite numbers, a state that is too old, a command that is too old while the arm moves, an
-    arm that does not follow its set-points, a pause between ticks while it moves, and a clock that does not advance. A target beyond the joint limits is cut to them. Commands take effect only after
-    `start`; after a stop only after `resume`.
+    latched. What stops the arm as well: a command that is no J finite numbers, or too old while the arm moves; a state that is too old;
+    an arm that does not follow its set-points; a pause between ticks while it moves; a clock that does not advance. A target beyond the
+    joint limits is cut to them. Commands take effect only after `start`; after a stop only after `resume`.
 
     It replaces no emergency stop. Its methods may be called from any thread.
 

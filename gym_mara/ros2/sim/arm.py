@@ -70,7 +70,7 @@ class SimulatedArm:
             delay: from now to its start, s; negative if it has already started.
 
         Raises:
-            GymMaraError: it is not complete and finite, has other joints, or is over since long. Nothing changes.
+            GymMaraError: it is not complete and finite, has other joints, or ended long ago. Nothing changes.
         """
         if not len(points):
             return self._command(None, 0.0)
