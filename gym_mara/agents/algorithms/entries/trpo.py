@@ -52,7 +52,8 @@ _ANY_TARGET = Preset(
         "gamma": 0.98,
         "gae_lambda": 0.95,
         "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
-        "target_kl": 0.01,
+        "target_kl": 0.004,
+        "cg_max_steps": 10,
         "cg_damping": 0.01,
         "n_critic_updates": 3,
         "policy_kwargs": {
