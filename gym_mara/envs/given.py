@@ -70,7 +70,7 @@ class Given:
         for arm in _distinct(chosen, position, quaternion):
             target = _row(position, arm), _row(quaternion, arm)
             if far := out_of_reach(robot, workspace, *target):
-                raise GymMaraError(f"{far}: give another, or leave it out, and it is drawn")
+                raise GymMaraError(f"{far}: give another")
             workspace.pose_with(*target)
         return cls(position, quaternion, start)
 

@@ -48,8 +48,8 @@ class Deployment:
         policy: the policy.
         env: the name of an environment; None for that of the training.
         options: keyword arguments of the environment with the backend "ros2", which replace those of the training.
-        log: is called with a sentence about a refused target and about each stop; in a dry run also once a second with what would
-            be sent.
+        log: is called with a line whenever what the arm does changes, and for each refused target; in a dry run also once a second
+            with what would be sent.
 
     Raises:
         GymMaraError: the policy does not fit the environment, an option is unknown, there is no arm, or it cannot be moved.
@@ -87,6 +87,8 @@ class Deployment:
         self._steps, self._missed = 0, 0
         self._lateness: deque[float] = deque(maxlen=_WINDOW)
         self._error: float | None = None
+        self._reached = False
+        self._told = ""
         try:
             policy.check(self._arms)
             # What takes long the first time does so before the arm moves.
@@ -149,7 +151,7 @@ class Deployment:
         try:
             self.check(asked)
         except GymMaraError as error:
-            self._log(f"the target {[*asked.position]} is refused: {error}")
+            self._log(f"target refused: {error}")
         else:
             with self._lock:
                 self._next = asked
@@ -204,12 +206,19 @@ class Deployment:
                     self._episode(end)
                 else:
                     self._wait()
-            except ArmStoppedError as error:
-                self._log(str(error))
+            except ArmStoppedError:
                 self._wait_for_resume(end)
 
     def _over(self, end: float) -> bool:
+        self._tell()
         return self._ended or self._clock.now() >= end
+
+    def _tell(self) -> None:
+        """Log what the arm does, when that changes."""
+        status, _ = self._status
+        if status != self._told:
+            self._told = status
+            self._log(status)
 
     def _wait(self) -> None:
         self._clock.sleep_until(self._clock.now() + _WAIT)
@@ -219,7 +228,7 @@ class Deployment:
         with self._lock:
             new, self._next = self._next, None
         if new is not None:
-            self._target = new
+            self._target, self._reached = new, False
             if began:
                 self.simulation.set_goal(new.position, new.quaternion or (1.0, 0.0, 0.0, 0.0))
         return self._target is not None
@@ -239,7 +248,7 @@ class Deployment:
             observation = outcome.observation
             self._note(outcome.info)
             if not self._driver.live and self._steps % max(1, round(1.0 / period)) == 0:
-                self._log(f"would send: {', '.join(f'{q:.3f}' for q in self._setpoint)} rad (m)")
+                self._log(f"would send: {', '.join(f'{q:.3f}' for q in self._setpoint)}")
             self._driver.check()
 
     def _begin(self) -> Floats:
@@ -257,6 +266,7 @@ class Deployment:
         self._missed += int(info["missed_ticks"][0])
         self._lateness.append(float(info["lateness"][0]))
         self._error = float(info["distance"][0]) if "distance" in info else None
+        self._reached = self._reached or bool(info.get("success", [False])[0])
 
     def _wait_for_resume(self, end: float) -> None:
         while not self._over(end):
@@ -279,9 +289,14 @@ class Deployment:
             return f"failed: {failure}", True
         if safety.mode in (Mode.STOPPING, Mode.STOPPED):
             return f"stopped: {safety.reason}", True
-        if self.follows and self._target is None:
-            return "waits for a target", False
-        return "moves", False
+        state = self._driver.link.state
+        age = np.inf if state is None else self._clock.now() - state.received
+        if age > safety.watchdogs.state_age + _WAIT:
+            return "hears nothing from the arm", True
+        if self._target is not None:
+            where = ", ".join(f"{value:.3f}" for value in self._target.position)
+            return f"{'has reached' if self._reached else 'moves to'} {where} m", False
+        return "waits for a target" if self.follows else "moves", False
 
     @property
     def diagnostics(self) -> Diagnostics:

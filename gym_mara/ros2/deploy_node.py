@@ -40,7 +40,6 @@ class DeployNode:
         node = ros.node
         model = deployment.simulation.robot.model
         self._frames: dict[str, pin.SE3] = {
-            "": pin.SE3.Identity(),
             "world": pin.SE3.Identity(),
             **{f.name: f.placement for f in model.frames if f.parentJoint == 0},
         }
@@ -55,7 +54,8 @@ class DeployNode:
 
     def _aim(self, message: Any) -> None:
         try:
-            frame = one_of("frame of a target", message.header.frame_id.lstrip("/"), self._frames)
+            name = message.header.frame_id.lstrip("/") or "world"
+            frame = one_of("frame of a target", name, self._frames)
             self._deployment.aim(
                 _target(message.pose, self._frames[frame], self._deployment.oriented)
             )

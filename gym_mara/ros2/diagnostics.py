@@ -11,9 +11,9 @@ class Diagnostics(NamedTuple):
     """What a deployment reports about itself."""
 
     status: str
-    """What the arm does: "waits for a target", "moves", "stopped: " and why, or "failed: " and why."""
+    """What the arm does, in words, such as "waits for a target", or "stopped: " and why."""
     in_trouble: bool
-    """Whether it is stopped or has failed."""
+    """Whether it is stopped or has failed, or reports no state."""
     steps: int
     missed_ticks: int
     """Of the policy, control periods."""
@@ -50,5 +50,5 @@ class Diagnostics(NamedTuple):
             ),
             ("age of the arm's state, ms", f"{1e3 * self.state_age:.1f}"),
             ("refused messages", refused or "none"),
-            ("set-point, rad (m)", ", ".join(f"{value:.3f}" for value in self.setpoint)),
+            ("set-point", ", ".join(f"{value:.3f}" for value in self.setpoint)),
         ]

@@ -119,8 +119,7 @@ class Driver:
             ) from self._failure
         if self.safety.mode in (Mode.STOPPING, Mode.STOPPED):
             raise ArmStoppedError(
-                f"the arm has stopped: {self.safety.reason}; when it is safe, resume it with the service /gym_mara/resume or "
-                "Driver.resume"
+                f"the arm has stopped: {self.safety.reason}; when it is safe, an operator has to resume it"
             )
 
     @property

@@ -38,6 +38,8 @@ def record(
     """
     from gym_mara.ros2.bags.recording import record as run
 
+    if bag.exists():
+        raise GymMaraError(f"{str(bag)!r} exists and is not overwritten: delete it first")
     err.print("Recording; stop with Ctrl-C.")
     counts = run(bag, topic, seconds, domain=domain)
     _print(f"Recorded in {bag}", counts)

@@ -67,7 +67,7 @@ def check(
         table.add_row(mark, line.what, line.found, "" if line.ok else line.remedy)
     out.print(table)
     latency = report.figures["latency"]
-    if latency is not None:
+    if latency is not None and report.ok:
         ends = ", ".join(f"{value:.4f}" for value in latency)
         out.print(f"for training: --set 'randomisation={{\"latency\": [{ends}]}}'", soft_wrap=True)
     if as_json is not None:

@@ -16,7 +16,6 @@ from rich.table import Table
 from gym_mara.cli.common import (
     SetOption,
     env_name,
-    err,
     keyword_arguments,
     needs_agents,
     number,
@@ -100,7 +99,10 @@ def deploy(
 
         out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
         if not live:
-            out.print("note: a dry run; nothing is sent without --live.", soft_wrap=True)
+            out.print(
+                "note: a dry run. Nothing is sent without --live, so that the arm stays where it is.",
+                soft_wrap=True,
+            )
         deployment = Deployment(exported, env, options, _note)
         with _ended_by_signals(deployment.end), closing(deployment):
             for note in deployment.link_notes:
@@ -119,7 +121,8 @@ def deploy(
 
 
 def _note(text: str) -> None:
-    err.print(text, soft_wrap=True)
+    out.print(text, soft_wrap=True)  # on the console of the table, which it would tear otherwise
+    out.file.flush()
 
 
 def _parsed(text: str) -> Target:

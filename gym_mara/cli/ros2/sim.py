@@ -75,6 +75,7 @@ def sim(
         node = stack.enter_context(
             closing(SimNode(arm, clock=clock, domain=domain, on_tick=on_tick))
         )
+        node.check_alone()
         out.print(f"ready: {node.summary}", soft_wrap=True, highlight=False)
         out.file.flush()
         node.run(seconds)

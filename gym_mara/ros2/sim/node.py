@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 from gym_mara.errors import GymMaraError
-from gym_mara.ros2 import messages
+from gym_mara.ros2 import graph, messages
 from gym_mara.ros2.arm import Clock, WallClock
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.sim.arm import Pace, SimulatedArm
@@ -20,6 +21,8 @@ with needs_ros("a simulated arm"):
     from std_srvs.srv import Trigger
     from trajectory_msgs.msg import JointTrajectory
 
+DISCOVERY = 0.5
+"""How long other nodes take to be discovered, s."""
 NODE = "gym_mara_sim"
 """The name of the node."""
 JOINT_STATES = "/joint_states"
@@ -89,6 +92,20 @@ class SimNode:
             self._actions = FollowAction(node, ACTION, arm, self.delay_of)
             kind = messages.controller_state_type()
             self._mara_states = node.create_publisher(kind, MARA_2019_STATE, messages.SENSOR_DATA)
+
+    def check_alone(self) -> None:
+        """Check that no other arm has the same topics, after the time that it takes to discover others.
+
+        Raises:
+            GymMaraError: another one has.
+        """
+        time.sleep(DISCOVERY)
+        node = self.ros.node
+        if rivals := graph.others(graph.publishers(node, JOINT_STATES), node, 1):
+            raise GymMaraError(
+                f"{graph.names(rivals)} publishes {JOINT_STATES} too, in the ROS domain {self.ros.domain}: end it, or choose another "
+                "--domain, because commands would move both arms"
+            )
 
     @property
     def summary(self) -> str:
