@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +21,7 @@ from gym_mara.cli.ros2.options import (
     profile_of,
 )
 from gym_mara.deploy import OnnxPolicy
-from gym_mara.files import written_aside
+from gym_mara.files import write_json
 from gym_mara.robot import RobotModel
 
 
@@ -76,7 +75,6 @@ def check(
             "lines": [line._asdict() for line in report.lines],
             **report.figures,
         }
-        with written_aside(as_json, new=True) as temporary:
-            temporary.write_text(json.dumps(values, indent=2))
+        write_json(as_json, values, new=True)
     if not report.ok:
         raise typer.Exit(1)
