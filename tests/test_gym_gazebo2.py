@@ -130,3 +130,8 @@ def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> N
 def test_an_invalid_episode_size_is_refused(size: Any) -> None:
     with pytest.raises(GymMaraError, match="episode_size"):
         GazeboMaraEnv().set_episode_size(size)
+
+
+def test_the_real_arm_has_its_bare_id_and_the_form_of_its_commands() -> None:
+    spec = gymnasium.spec("MARAReal-v0")
+    assert spec.kwargs == {"task": "MARA-v0", "backend": "ros2", "profile": "mara-2019"}
