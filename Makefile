@@ -52,7 +52,7 @@ CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
 TESTS ?=
 # Another Gymnasium changes nothing in these.
-OTHER_TESTS = $(patsubst %,tests/test_%.py,benchmark_reach cli_fuzz cli_process cli_robot docs errors examples files package rotations snapshots)
+OTHER_TESTS = $(patsubst %,tests/test_%.py,arrays benchmark_reach benchmarks cli_fuzz cli_process cli_robot docs errors examples files package robot_options rotations snapshots)
 # The others need no ROS.
 ROS_TESTS = $(addprefix tests/ros2/,sim bags/test_recording.py test_check.py test_faults.py test_link.py test_node.py)
 GYMNASIUM_TESTS = $(filter-out $(OTHER_TESTS),$(wildcard tests/test_*.py)) tests/envs tests/rendering/test_pictures.py tests/agents/test_sb3.py

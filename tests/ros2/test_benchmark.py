@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
-
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "ros2.py"
 
 
+@pytest.mark.nightly
 def test_a_simulated_arm_and_a_policy_on_it_are_measured() -> None:
     command = [sys.executable, str(SCRIPT), "--parts", "sim", "deploy", "--seconds", "1"]
     done = subprocess.run(
@@ -25,6 +24,7 @@ def test_a_simulated_arm_and_a_policy_on_it_are_measured() -> None:
     assert found == ["sim: dart", "sim: mujoco", *(f"deploy: {name}" for name in profiles)]
 
 
+@pytest.mark.slow
 def test_the_filter_is_measured_with_and_without_collision_checks() -> None:
     command = [sys.executable, str(SCRIPT), "--parts", "filter", "--seconds", "1"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
