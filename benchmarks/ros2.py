@@ -4,7 +4,8 @@
 
 The time of the filter is that of one call on the clock of the wall. On a machine with other work its percentiles are of that work as
 well, so the time of the CPU stands beside it. The simulated arm and the policy are two processes, each on one core, in a ROS domain
-of this machine alone. The policy is the pretrained one of MARAReach-v0; it gets a new random target every eight seconds.
+of this machine alone. The policy is the pretrained one of MARAReach-v0; it gets a new random target every eight seconds, to which there is a
+straight joint move without a collision, as in the episodes of the environment.
 """
 
 from __future__ import annotations
@@ -208,7 +209,8 @@ def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floa
     rng, poses = np.random.default_rng(0), FreePoses(robot)
     errors, stops = [], 0
     for _ in range(targets):
-        position, _ = poses.draw(rng)
+        here = np.clip(deployed.backend.state.q[0], robot.lower, robot.upper)
+        _, position, _ = poses.draw_move(rng, here)
         deployed.aim(Target(tuple(position.tolist()))).result()
         deployed.run(HOLD)
         if deployed.diagnostics.status.startswith("stopped"):

@@ -29,7 +29,7 @@ from tests.ros2.peers import Peer, eventually
 
 pytestmark = pytest.mark.slow
 
-FAULTS = 20
+FAULTS = 12
 HOLD = 1.0
 """Within this time after a fault the arm rests, s: what the watchdogs take, and a deceleration."""
 REST = 0.03
