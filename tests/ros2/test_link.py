@@ -33,13 +33,6 @@ COMMANDS = make_profile().command_topic
 
 
 @pytest.fixture
-def peer(ros_domain: int) -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def links(ros_domain: int) -> Iterator[Callable[..., RosLink]]:
     made: list[RosLink] = []
 

@@ -60,13 +60,6 @@ def running(
 
 
 @pytest.fixture
-def peer(ros_domain: int) -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def node(ros_domain: int) -> Iterator[SimNode]:
     with running() as made:
         yield made
