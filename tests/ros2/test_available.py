@@ -1,17 +1,23 @@
-"""The tests with ROS are skipped where rclpy has no wheels, and only there."""
+"""The tests with ROS and with bags are skipped where libraries have no wheels, and only there."""
 
 from __future__ import annotations
 
+import importlib
 import platform
 import sys
 
 import pytest
 
+ELSEWHERE = (sys.platform, platform.machine()) != ("linux", "x86_64")
 
-@pytest.mark.skipif(
-    (sys.platform, platform.machine()) != ("linux", "x86_64"), reason="rclpy has no wheels here"
+
+@pytest.mark.parametrize(
+    "library",
+    [
+        pytest.param("rclpy", marks=pytest.mark.skipif(ELSEWHERE, reason="no wheels")),
+        "rosbags",
+        "ruckig",
+    ],
 )
-def test_rclpy_is_installed_where_it_has_wheels() -> None:
-    import rclpy
-
-    assert rclpy.__file__
+def test_what_the_extra_has_is_installed(library: str) -> None:
+    assert importlib.import_module(library)

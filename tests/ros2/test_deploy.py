@@ -10,10 +10,12 @@ import pytest
 
 from gym_mara.backends import registry
 from gym_mara.deploy import OnnxPolicy
+from gym_mara.envs import make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.pretrained import pretrained_file
 from gym_mara.ros2.deploy import Deployment, Target
-from tests.ros2.fake import FakeArm, FakeClock
+from tests.helpers import Cli
+from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend
 
 NEAR, OTHER = Target((-0.4, 0.095, 0.87)), Target((-0.3, 0.4, 0.9))
 AWAY = Target((5.0, 0.0, 0.0))
@@ -202,3 +204,21 @@ def test_a_policy_with_a_target_of_its_own_takes_no_other(
     deployment.follows = False
     with pytest.raises(GymMaraError, match="own"):
         deployment.aim(NEAR)
+
+
+@pytest.mark.parametrize("name", ["live", "profile", "domain"])
+def test_set_does_not_move_the_arm_in_a_dry_run(gym_mara: Cli, name: str) -> None:
+    code, _, error = gym_mara("ros2", "deploy", "policy.onnx", "--set", f"{name}=true")
+    assert code == 2
+    assert f"--set {name} has no effect here: give --{name}" in error
+
+
+def test_an_environment_that_cannot_be_made_leaves_no_arm_driven(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(registry._BACKENDS, "ros2", "tests.ros2.fake:FakeRos2Backend")
+    closed: list[FakeRos2Backend] = []
+    monkeypatch.setattr(FakeRos2Backend, "close", lambda backend: closed.append(backend))
+    with pytest.raises(GymMaraError, match="action_scale"):
+        make_vector_env("MARAReach-v0", 1, backend="ros2", live=True, action_scale=[0.1, 0.1])
+    assert len(closed) == 1
