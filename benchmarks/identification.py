@@ -1,4 +1,9 @@
-"""How well hidden parameters of a simulated arm are identified, and how long it takes."""
+"""How well hidden parameters of a simulated arm are identified, and how long it takes.
+
+    python -m benchmarks.identification [--backend mujoco]
+
+It runs as a module, in the root of the repository, because the hidden arms are those of the tests.
+"""
 
 from __future__ import annotations
 
