@@ -12,7 +12,7 @@ import numpy as np
 
 from gym_mara.backends.ros2 import Ros2Backend
 from gym_mara.deploy import OnnxPolicy
-from gym_mara.envs import make_vector_env
+from gym_mara.envs import make_vector_env, task_keywords
 from gym_mara.envs.given import Given
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
@@ -30,6 +30,9 @@ _WINDOW = 1000
 """Over how many of the last actions their lateness is measured."""
 _WAIT = 0.05
 """How often a deployment that waits looks for a target or a resume, s."""
+_SLOW_WITHIN = 0.1
+"""The error from which the steps of a policy shrink, m, where its task has such a setting and none is given. That is twice what a
+training has: a real arm answers late, and would swing around some targets."""
 
 
 class Target(NamedTuple):
@@ -47,7 +50,8 @@ class Deployment:
     Args:
         policy: the policy.
         env: the name of an environment; None for that of the training.
-        options: keyword arguments of the environment with the backend "ros2", which replace those of the training.
+        options: keyword arguments of the environment with the backend "ros2", which replace those of the training. Without
+            `slow_within` the steps of a policy shrink from 0.1 m on, where the training had less.
         log: is called with a line whenever what the arm does changes, and for each refused target; in a dry run also once a second
             with what would be sent.
 
@@ -64,10 +68,14 @@ class Deployment:
         log: Callable[[str], None],
     ) -> None:
         self.policy, self._log = policy, log
+        name = env or policy.about.env
+        if "slow_within" in task_keywords(name):
+            trained = policy.about.training.env_options.get("slow_within", 0.0)
+            options = {"slow_within": max(trained, _SLOW_WITHIN), **options}
         keywords = policy.keywords(env, "ros2", **options)
         keywords.setdefault("on_collision", "continue")
         self._checks = ThreadPoolExecutor(1, "gym_mara targets")
-        self._arms = make_vector_env(env or policy.about.env, 1, **keywords)
+        self._arms = make_vector_env(name, 1, **keywords)
         self.simulation = simulation = self._arms.simulation
         assert isinstance(simulation.backend, Ros2Backend)
         self.backend: Ros2Backend = simulation.backend

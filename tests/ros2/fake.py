@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -63,16 +63,35 @@ class FakeArm:
         self.closed = True
 
 
+class LateArm(FakeArm):
+    """Follows its set-points with the lag of a servo, 0.1 s, and reports where it was two periods ago."""
+
+    def __init__(self, clock: FakeClock, q: Floats) -> None:
+        super().__init__(clock, q)
+        self._reports = deque([(self.q, self.qd)], maxlen=3)
+
+    @property
+    def state(self) -> ArmState | None:
+        q, qd = self._reports[0]
+        return ArmState(q.copy(), qd.copy(), None, self.clock.now(), self.clock.now())
+
+    def send(self, setpoint: Setpoint, period: float) -> None:
+        step = (1.0 - np.exp(-10.0 * period)) * (setpoint.q - self.q)
+        self.q, self.qd = self.q + step, step / period
+        self._reports.append((self.q, self.qd))
+
+
 class FakeRos2Backend(Ros2Backend):
     """The backend with an arm and a clock of its own."""
 
     _in_thread: ClassVar[bool] = False
     start_q: ClassVar[Floats | None] = None
+    arm_class: ClassVar[type[FakeArm]] = FakeArm
     clock: FakeClock  # type: ignore[assignment]
     arm: FakeArm
 
     def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
         self.clock = FakeClock(lambda: self.driver)
         q = self.robot.home if self.start_q is None else self.start_q
-        self.arm = FakeArm(self.clock, q)
+        self.arm = self.arm_class(self.clock, q)
         return self.arm, self.clock

@@ -15,7 +15,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.pretrained import pretrained_file
 from gym_mara.ros2.deploy import Deployment, Target
 from tests.helpers import Cli
-from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend
+from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend, LateArm
 
 NEAR, OTHER = Target((-0.4, 0.095, 0.87)), Target((-0.3, 0.4, 0.9))
 AWAY = Target((5.0, 0.0, 0.0))
@@ -67,6 +67,17 @@ def test_it_reaches_a_target_and_follows_the_next_one(deploy: Callable[..., Depl
         assert _error(deployment, target) < 1e-4
         assert deployment.diagnostics.error == pytest.approx(_error(deployment, target), abs=1e-6)
     assert deployment.diagnostics.status == "has reached -0.400, 0.095, 0.870 m"
+
+
+def test_it_comes_to_rest_at_targets_around_which_a_late_arm_would_swing(
+    deploy: Callable[..., Deployment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeRos2Backend, "arm_class", LateArm)
+    deployment = deploy()
+    for target in (Target((0.694, -0.231, 1.060)), Target((-0.165, 0.138, 1.682))):
+        deployment.aim(target).result()
+        deployment.run(8.0)
+        assert _error(deployment, target) < 1e-4
 
 
 def test_without_a_target_the_arm_rests(deploy: Callable[..., Deployment]) -> None:
