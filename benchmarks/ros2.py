@@ -1,10 +1,10 @@
 """How fast and how exact the ROS 2 part is: the safety filter, the simulated arm, and a policy that is deployed on it.
 
-    python benchmarks/ros2.py [--parts filter sim deploy] [--seconds 60] [--targets 20]
+    python benchmarks/ros2.py [--parts filter sim deploy] [--seconds 60] [--targets 20] [--env MARAReach-v0]
 
 The time of the filter is that of one call on the clock of the wall. On a machine with other work its percentiles are of that work as
 well, so the time of the CPU stands beside it. The simulated arm and the policy are two processes, each on one core, in a ROS domain
-of this machine alone. The policy is the pretrained one of MARAReach-v0; it gets a new random target every eight seconds, to which there is a
+of this machine alone. The policy is the pretrained one of an environment; it gets a new random target every eight seconds, to which there is a
 straight joint move without a collision, as in the episodes of the environment.
 """
 
@@ -31,6 +31,7 @@ from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.ros2.arm import ArmState
 from gym_mara.ros2.safety.filter import Mode, SafetyFilter
 from gym_mara.ros2.safety.motion import MotionLimits
+from gym_mara.rotations import angle_between
 
 if TYPE_CHECKING:
     from gym_mara.ros2.deploy import Deployment
@@ -53,6 +54,7 @@ def main() -> None:
     )
     parser.add_argument("--robot", default="mara", help="the arm of the filter (mara)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--env", default="MARAReach-v0", help="of the policy (MARAReach-v0)")
     parser.add_argument("--targets", type=int, default=20, help="of the policy, for a profile (20)")
     parser.add_argument(
         "--seconds",
@@ -68,7 +70,7 @@ def main() -> None:
     if "sim" in arguments.parts:
         simulated_arm(arguments.seconds)
     if "deploy" in arguments.parts:
-        deployment(arguments.targets)
+        deployment(arguments.env, arguments.targets)
 
 
 def safety_filter(robot: RobotModel, seconds: float) -> None:
@@ -172,26 +174,26 @@ def simulated_arm(seconds: float) -> None:
         )
 
 
-def deployment(targets: int) -> None:
+def deployment(env: str, targets: int) -> None:
     """Print how punctual a deployed policy is, and how near it comes to random targets, with each profile."""
     from gym_mara.ros2.deploy import Deployment
 
     robot = RobotModel.load("mara")
-    policy = OnnxPolicy(pretrained_file("MARAReach-v0"))
+    policy = OnnxPolicy(pretrained_file(env))
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     for profile in ("trajectory", "forward", "mara-2019"):
         with _simulation("--backend", "dart"):
             deployed = Deployment(policy, None, {"profile": profile, "live": True}, _quiet)
             try:
-                errors, stops = _errors(deployed, robot, targets)
+                errors, angles, stops = _errors(deployed, robot, targets)
                 found = deployed.diagnostics
             finally:
                 deployed.close()
         ticks = found.setpoints
         late = [1e3 * value for value in (*ticks.lateness, *found.lateness)]
         print(
-            f"deploy: {profile}, {targets} targets on dart: error p50 {np.median(errors):.4f}, p95 {np.quantile(errors, 0.95):.4f} mm, "
-            f"{stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
+            f"deploy: {profile}, {targets} targets of {env} on dart: error p50 {np.median(errors):.4f}, p95 {np.quantile(errors, 0.95):.4f} mm, "
+            f"angle p50 {np.median(angles):.4f}, p95 {np.quantile(angles, 0.95):.4f} degrees, {stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
             f"{ticks.missed} of {ticks.ticks} missed; actions at 50 Hz: late by p50 {late[3]:.2f}, p99 {late[4]:.2f} ms, "
             f"{found.missed_ticks} of {found.steps} missed",
             flush=True,
@@ -202,24 +204,27 @@ def _quiet(line: str) -> None:
     """What a deployment says of itself is not printed."""
 
 
-def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floats, int]:
-    """The distance to each target at its end, mm, and how often the filter stopped the arm."""
+def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floats, Floats, int]:
+    """The distance to each target at its end, mm, the angle, degrees, and how often the filter stopped the arm."""
     from gym_mara.ros2.deploy import Target
 
     rng, poses = np.random.default_rng(0), FreePoses(robot)
-    errors, stops = [], 0
+    errors, angles, stops = [], [], 0
     for _ in range(targets):
         here = np.clip(deployed.backend.state.q[0], robot.lower, robot.upper)
-        _, position, _ = poses.draw_move(rng, here)
-        deployed.aim(Target(tuple(position.tolist()))).result()
+        _, position, quaternion = poses.draw_move(rng, here)
+        orientation = tuple(quaternion.tolist()) if deployed.oriented else None
+        deployed.aim(Target(tuple(position.tolist()), orientation)).result()
         deployed.run(HOLD)
         if deployed.diagnostics.status.startswith("stopped"):
             stops += 1
             deployed.resume()
             continue
-        away = deployed.backend.state.ee_position[0] - position
-        errors.append(1e3 * float(np.linalg.norm(away)))
-    return np.array(errors or [np.nan]), stops
+        state = deployed.backend.state
+        errors.append(1e3 * float(np.linalg.norm(state.ee_position[0] - position)))
+        if deployed.oriented:
+            angles.append(float(np.degrees(angle_between(state.ee_quaternion[0], quaternion))))
+    return np.array(errors or [np.nan]), np.array(angles or [np.nan]), stops
 
 
 if __name__ == "__main__":
