@@ -116,12 +116,27 @@ def test_unknown_names_are_errors_that_list_the_known_ones() -> None:
 
 def test_the_defaults_are_registered() -> None:
     assert DEFAULT_PRESET in algorithm(DEFAULT_ALGORITHM).presets
-    assert preset_names() == ["tuned", "paper"]
+    assert preset_names() == ["tuned", "paper", "robust"]
 
 
 def test_there_is_a_preset_for_each_way_of_moving(a2c: Algorithm) -> None:
     assert a2c.preset("tuned", teleports=True).num_envs == 16
     assert a2c.preset("tuned", teleports=False).num_envs == 8
+
+
+@pytest.mark.parametrize("family", ["", "any_target"])
+def test_a_policy_of_the_preset_tuned_is_trained_further_with_the_preset_robust(
+    family: str,
+) -> None:
+    for teleports in (False, True):
+        tuned, robust = (
+            algorithm("ppo").preset(name, teleports=teleports, family=family)
+            for name in ("tuned", "robust")
+        )
+        assert robust.arguments["policy_kwargs"] == tuned.arguments["policy_kwargs"]
+        assert robust.arguments["learning_rate"][0][1] == pytest.approx(
+            0.1 * tuned.arguments["learning_rate"][0][1]
+        )
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """PPO: its presets and its search space."""
 
+from dataclasses import replace
+
 from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, Presets, SearchSpace
 from gym_mara.agents.algorithms.entries import PAPER_NETWORK
 
@@ -77,6 +79,14 @@ _PAPER = Preset(
     },
 )
 
+
+def _robust(tuned: Preset) -> Preset:
+    """A tenth of the learning rate: for a policy that is trained further, with random arms, and must not forget what it can."""
+    points = tuned.arguments["learning_rate"]
+    rate = tuple((progress, 0.1 * value) for progress, value in points)
+    return replace(tuned, arguments={**tuned.arguments, "learning_rate": rate})
+
+
 ALGORITHM = Algorithm(
     name="ppo",
     summary="proximal policy optimisation, from Stable-Baselines3",
@@ -84,6 +94,9 @@ ALGORITHM = Algorithm(
     presets={
         "tuned": Presets(_TELEPORTING, _TRAVELLING, {"any_target": _ANY_TARGET}),
         "paper": Presets(teleporting=_PAPER, travelling=_PAPER),
+        "robust": Presets(
+            _robust(_TELEPORTING), _robust(_TRAVELLING), {"any_target": _robust(_ANY_TARGET)}
+        ),
     },
     search_space=SearchSpace(
         arguments={
