@@ -23,7 +23,7 @@ _RESET_SPEED = 0.25
 _ARRIVED = 0.01
 """How near each joint comes to a start pose, rad (m)."""
 _STILL = 0.05
-"""The largest velocity of a joint at rest, rad/s (m/s)."""
+"""The largest velocity of a joint that has arrived there, rad/s (m/s), unless `rest_velocity` is larger."""
 _CONNECTING = 5.0
 """How long the first state of the arm may take, s."""
 _RESET_TIME = 60.0
@@ -53,6 +53,7 @@ class Ros2Backend(Backend):
         setpoint_period: the time between two set-points, s.
         command_age: the arm stops if no action has come for so long, s. A training that pauses to learn needs more.
         tracking_error: the arm stops if a joint is so far from its set-point, rad (m).
+        rest_velocity: the arm starts and resumes only while no joint is measured to be faster, rad/s (m/s). Noisy encoders need more.
         collision: the collision engine, as of the backend "pinocchio".
 
     Raises:
@@ -82,6 +83,7 @@ class Ros2Backend(Backend):
         setpoint_period: float = 0.01,
         command_age: float = 0.2,
         tracking_error: float = 0.2,
+        rest_velocity: float = 0.02,
         collision: str = "coal",
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
@@ -90,7 +92,9 @@ class Ros2Backend(Backend):
         self._checker = make_checker(collision, robot)
         self._kinematics = robot.kinematics()
         period = positive_number("setpoint_period", setpoint_period, "s", at_most=control_period)
-        watchdogs = Watchdogs(command_age=command_age, tracking_error=tracking_error)
+        watchdogs = Watchdogs(
+            command_age=command_age, tracking_error=tracking_error, rest_velocity=rest_velocity
+        )
         safety = SafetyFilter(robot, period, limits, watchdogs, make_checker(collision, robot))
         live = flag("live", live)
         link, clock = self._connect(
@@ -169,7 +173,8 @@ class Ros2Backend(Backend):
 
     def _rests_at(self, goal: Floats) -> bool:
         state = self._reported()
-        near, still = np.abs(state.q - goal) < _ARRIVED, np.abs(state.qd) < _STILL
+        slow = max(_STILL, self.driver.safety.watchdogs.rest_velocity)
+        near, still = np.abs(state.q - goal) < _ARRIVED, np.abs(state.qd) < slow
         return bool(near.all() and still.all())
 
     def step(self, q_target: Floats) -> SimState:

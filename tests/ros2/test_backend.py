@@ -15,7 +15,7 @@ from gym_mara.backends import backend_names, make_backend, registry, simulated_b
 from gym_mara.envs import make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.arm import Clock, Link, WallClock
+from gym_mara.ros2.arm import ArmState, Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError
 from tests.helpers import PATH_ENDS
 from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend
@@ -240,6 +240,24 @@ def test_an_arm_that_does_not_follow_stops(make: Make) -> None:
     backend.arm.follows = False
     with pytest.raises(ArmStoppedError, match="does not follow"):
         _steps(backend, 100)
+
+
+def test_an_arm_with_noisy_encoders_starts_and_arrives(
+    robot: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noise = np.random.default_rng(0)
+
+    def noisy(arm: FakeArm) -> ArmState:
+        qd = arm.qd + noise.uniform(-0.09, 0.09, len(arm.qd))
+        return ArmState(arm.q.copy(), qd, None, arm.clock.now(), arm.clock.now())
+
+    monkeypatch.setattr(FakeArm, "state", property(noisy))
+    with pytest.raises(GymMaraError, match="rest_velocity"):
+        FakeRos2Backend(robot, 1, live=True)
+    backend = FakeRos2Backend(robot, 1, live=True, rest_velocity=0.1)
+    before = backend.clock.now()
+    backend.reset(backend.state.q + 0.2)
+    assert backend.clock.now() - before < 2.0
 
 
 def test_a_learner_that_pauses_leaves_the_arm_at_rest_at_its_last_target(make: Make) -> None:
