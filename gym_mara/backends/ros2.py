@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -26,8 +27,11 @@ _STILL = 0.05
 """The largest velocity of a joint that has arrived there, rad/s (m/s), unless `rest_velocity` is larger."""
 _CONNECTING = 5.0
 """How long the first state of the arm may take, s."""
-_RESET_TIME = 60.0
-"""How long a motion to a start pose takes at most, s."""
+_RESET_TIME = 1.5
+"""How much longer than by the limits a motion to a start pose takes at most."""
+_ARRIVAL_TIME = 5.0
+"""How much longer still, s: an arm follows its set-points late, and comes to rest."""
+_INTERRUPTED = "the motion to the start pose was interrupted"
 
 
 class Ros2Backend(Backend):
@@ -88,7 +92,7 @@ class Ros2Backend(Backend):
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
         limits = MotionLimits.of(robot, max_joint_velocity, max_joint_acceleration, max_joint_jerk)
-        self.joint_velocity = limits.velocity
+        self._limits, self.joint_velocity = limits, limits.velocity
         self._checker = make_checker(collision, robot)
         self._kinematics = robot.kinematics()
         period = positive_number("setpoint_period", setpoint_period, "s", at_most=control_period)
@@ -104,6 +108,8 @@ class Ros2Backend(Backend):
         """Sets the pace."""
         self.driver = Driver(link, safety, self.clock, live=live)
         """Moves the arm."""
+        self.interrupted: Callable[[], bool] = lambda: False
+        """Whether a motion to a start pose shall end before it arrives; then the arm stops, and `reset` raises ArmStoppedError."""
         self._began = self._due = self.clock.now()
         self._lateness = self._missed = 0.0
         try:
@@ -153,19 +159,24 @@ class Ros2Backend(Backend):
             except ArmStoppedError:
                 raise
             except BaseException:
-                self.driver.stop("the motion to the start pose was interrupted")
+                self.driver.stop(_INTERRUPTED)
                 raise
             finally:
                 self.driver.safety.speed = 1.0
 
     def _wait_at(self, goal: Floats) -> None:
-        end = self.clock.now() + _RESET_TIME
+        # An arm that still moves brakes before, and returns.
+        least = self._limits.duration(goal - self._reported().q, _RESET_SPEED)
+        allowed = _RESET_TIME * (least + 3.0 * self.driver.safety.longest_stop) + _ARRIVAL_TIME
+        end = self.clock.now() + allowed
         while not self._rests_at(goal):
-            if self.clock.now() > end:
+            if self.interrupted():
+                self.driver.stop(_INTERRUPTED)
+            elif self.clock.now() > end:
                 off = np.abs(self._reported().q - goal)
                 joint = int(off.argmax())
                 raise GymMaraError(
-                    f"the arm has not reached the start pose within {_RESET_TIME:g} s: joint {self.robot.joint_names[joint]} is "
+                    f"the arm has not reached the start pose within {allowed:.3g} s: joint {self.robot.joint_names[joint]} is "
                     f"{off[joint]:.3g} rad (m) away; is its controller active, and does it follow?"
                 )
             self.driver.command(goal)

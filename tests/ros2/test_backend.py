@@ -94,6 +94,29 @@ def test_reset_moves_slowly_to_the_start_pose_and_ends_at_rest(make: Make) -> No
     assert state.time[0] == 0.0
 
 
+@pytest.mark.parametrize("fastest", [None, 0.05])
+def test_a_reset_takes_as_long_as_its_way_at_a_low_speed(make: Make, fastest: float | None) -> None:
+    backend = make(max_joint_velocity=fastest, max_joint_acceleration=1.0)
+    before = backend.clock.now()
+    backend.reset(backend.state.q + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
+    least = 1.0 / (0.25 * backend.joint_velocity[0])
+    assert abs(backend.clock.now() - before - least) < 2.0
+    if fastest:
+        assert least > 60.0
+
+
+def test_an_arm_that_does_not_arrive_is_an_error_soon(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = make(tracking_error=10.0)
+    backend.arm.follows = False
+    before = backend.clock.now()
+    with pytest.raises(GymMaraError, match=r"within .* s: joint motor1 is 0\.2 rad"):
+        backend.reset(backend.state.q + 0.2)
+    assert 5.0 < backend.clock.now() - before < 8.0
+    assert "interrupted" in (backend.driver.safety.reason or "")
+
+
 def test_reset_refuses_a_start_pose_behind_an_obstacle(robot: RobotModel) -> None:
     class There(FakeRos2Backend):
         start_q = np.array(PATH_ENDS[0])
