@@ -36,6 +36,17 @@ DISCOVERY = 0.5
 _POLL = 0.05
 
 
+def installed(profile: Profile) -> tuple[Profile, tuple[str, ...]]:
+    """A profile with the messages that are installed, and in what it differs from the one given."""
+    if profile.states != "controller_state" or messages.control_msgs_installed():
+        return profile, ()
+    replaced = profile.with_joint_states()
+    return replaced, (
+        f"control_msgs is not installed, so the states come from {replaced.state_topic} (sensor_msgs/JointState) and not from "
+        f"{profile.state_topic}",
+    )
+
+
 class RosLink:
     """The connection to one arm; see `gym_mara.ros2.arm.Link`.
 
@@ -73,15 +84,8 @@ class RosLink:
         if not isinstance(own, Profile):
             own = make_profile(own, controller=controller, namespace=namespace)
         own.check(robot.joint_names)
-        self.notes: tuple[str, ...] = ()
+        own, self.notes = installed(own)
         """In what the connection differs from its profile."""
-        if own.states == "controller_state" and not messages.control_msgs_installed():
-            replaced = own.with_joint_states()
-            self.notes = (
-                f"control_msgs is not installed, so the states come from {replaced.state_topic} (sensor_msgs/JointState) and not "
-                f"from {own.state_topic}",
-            )
-            own = replaced
         action = messages.follow_joint_trajectory_type() if own.commands == "action" else None
         self.robot, self.profile = robot, own
         self._lock = threading.Lock()
