@@ -14,6 +14,7 @@ from gym_mara.errors import GymMaraError, flag, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError, Driver
+from gym_mara.ros2.profiles import make_profile
 from gym_mara.ros2.safety.filter import SafetyFilter, Watchdogs
 from gym_mara.ros2.safety.motion import MotionLimits
 from gym_mara.state import SimState
@@ -51,7 +52,8 @@ class Ros2Backend(Backend):
         namespace: of the arm's topics, such as "/left".
         domain: the ROS domain; by default that of the environment variable ROS_DOMAIN_ID, or 0.
         live: whether the arm moves. Without it nothing is sent, and the arm stays where it is.
-        max_joint_velocity: rad/s (m/s), where it is below the robot's limits.
+        max_joint_velocity: rad/s (m/s), where it is below the robot's limits. With the profile "mara-2019" it is the velocity in the
+            points, too, with which each servo moves there; by default 0.5 there.
         max_joint_acceleration: rad/s² (m/s²); by default the velocity is reached in 0.2 s.
         max_joint_jerk: rad/s³ (m/s³); by default the acceleration is reached in 0.1 s.
         setpoint_period: the time between two set-points, s.
@@ -91,7 +93,9 @@ class Ros2Backend(Backend):
         collision: str = "coal",
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        limits = MotionLimits.of(robot, max_joint_velocity, max_joint_acceleration, max_joint_jerk)
+        own = make_profile(profile, controller=controller, namespace=namespace).velocity
+        fastest = own if max_joint_velocity is None else max_joint_velocity
+        limits = MotionLimits.of(robot, fastest, max_joint_acceleration, max_joint_jerk)
         self._limits, self.joint_velocity = limits, limits.velocity
         self._checker = make_checker(collision, robot)
         self._kinematics = robot.kinematics()
@@ -102,7 +106,13 @@ class Ros2Backend(Backend):
         safety = SafetyFilter(robot, period, limits, watchdogs, make_checker(collision, robot))
         live = flag("live", live)
         link, clock = self._connect(
-            profile, controller=controller, namespace=namespace, domain=domain, commands=live
+            profile,
+            controller=controller,
+            namespace=namespace,
+            # The servos are as fast as the points say, and shall follow.
+            velocity=None if own is None else float(limits.velocity.max()),
+            domain=domain,
+            commands=live,
         )
         self.clock: Clock = clock
         """Sets the pace."""

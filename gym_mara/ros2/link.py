@@ -55,7 +55,7 @@ class RosLink:
     Args:
         robot: the arm.
         profile: in which form it takes commands and reports states, and on which topics; or the name of a profile.
-        controller, namespace: of a profile that is given by its name; see `make_profile`.
+        controller, namespace, velocity: of a profile that is given by its name; see `make_profile`.
         node: the node to use, which is not closed with the link; by default one of its own.
         domain: the ROS domain of a node of its own; by default that of ROS_DOMAIN_ID, or 0.
         commands: whether commands will be sent. Without, no publisher of commands is made, which others would see.
@@ -72,17 +72,18 @@ class RosLink:
         *,
         controller: str | None = None,
         namespace: str = "",
+        velocity: float | None = None,
         node: RosNode | None = None,
         domain: int | None = None,
         commands: bool = True,
     ) -> None:
-        if isinstance(profile, Profile) and (controller is not None or namespace):
+        if isinstance(profile, Profile) and (namespace or (controller, velocity) != (None, None)):
             raise GymMaraError(
-                "a Profile has its topics: give controller and namespace to make_profile"
+                "a Profile has its topics: give controller, namespace and velocity to make_profile"
             )
         own = profile
         if not isinstance(own, Profile):
-            own = make_profile(own, controller=controller, namespace=namespace)
+            own = make_profile(own, controller=controller, namespace=namespace, velocity=velocity)
         own.check(robot.joint_names)
         own, self.notes = installed(own)
         """In what the connection differs from its profile."""

@@ -283,6 +283,30 @@ def test_an_arm_with_noisy_encoders_starts_and_arrives(
     assert backend.clock.now() - before < 2.0
 
 
+@pytest.mark.parametrize(
+    ("settings", "speed", "in_points"),
+    [
+        ({"profile": "mara-2019"}, 0.5, 0.5),
+        ({"profile": "mara-2019", "max_joint_velocity": 0.3}, 0.3, 0.3),
+        ({"profile": "mara-2019", "max_joint_velocity": 9.0}, 1.57, 1.57),
+        ({}, 1.57, None),
+    ],
+)
+def test_the_servos_of_2019_are_commanded_no_faster_than_their_points_say(
+    robot: RobotModel, settings: dict[str, Any], speed: float, in_points: float | None
+) -> None:
+    class Noted(FakeRos2Backend):
+        def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
+            assert options["velocity"] == in_points
+            return super()._connect(profile, **options)
+
+    backend = Noted(robot, 1, live=True, **settings)
+    backend.reset(backend.state.q)
+    for _ in range(100):
+        backend.step(backend.state.q + 1.0)
+    assert np.abs([sent.qd for sent in backend.arm.sent]).max() == pytest.approx(speed)
+
+
 def test_a_learner_that_pauses_leaves_the_arm_at_rest_at_its_last_target(make: Make) -> None:
     backend = make(command_age=2.0)
     target = backend.state.q + 0.1
