@@ -20,6 +20,8 @@ DESCRIPTION = "robot_description"
 """The topic of the URDF."""
 MARA_VELOCITY = 0.5
 """The velocity that gym-gazebo2 commands by default, rad/s."""
+LONGEST_TOPIC = 200
+"""The longest name of a topic, characters: DDS allows some more, of which ROS needs some itself."""
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -181,5 +183,9 @@ def _topic(what: str, given: str | None, *parts: str) -> str:
         raise GymMaraError(
             f"{what} {short(topic, 200)} is no name of ROS: it needs letters, digits and underscores between slashes, with no "
             "digit first and no two underscores together, such as /arm/joint_states; check controller and namespace too"
+        )
+    if len(topic) > LONGEST_TOPIC:
+        raise GymMaraError(
+            f"{what} has {len(topic)} characters with controller and namespace, and may have {LONGEST_TOPIC}: {short(topic, 80)}"
         )
     return topic

@@ -12,7 +12,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, short
 from gym_mara.files import read_text
 from gym_mara.robot import RobotModel
 from gym_mara.ros2 import messages
@@ -25,6 +25,7 @@ from gym_mara.ros2.profiles import DESCRIPTION, Profile
 
 with needs_ros("recording and replaying topics"):
     from ament_index_python.packages import get_package_share_path
+    from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 KINDS = (
@@ -193,7 +194,7 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
 
     Raises:
         DamagedFileError: the bag is missing or damaged.
-        GymMaraError: it has no message that can be published.
+        GymMaraError: it has no message that can be published, or a topic with a name that is none of ROS.
         MissingExtraError: ROS or `rosbags` is not installed.
     """
     with Bag(path) as bag:
@@ -205,12 +206,7 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
         counts = dict.fromkeys(topics, 0)
         node = RosNode("gym_mara_replay", domain=domain)
         try:
-            publishers = {
-                topic: node.node.create_publisher(
-                    message_class(bag.topics[topic]), PREFIX + topic, _DEPTH
-                )
-                for topic in topics
-            }
+            publishers = {topic: _publisher(node, topic, bag.topics[topic]) for topic in topics}
             time.sleep(DISCOVERY)
             begin, first = time.monotonic(), None
             for connection, stamp, data in bag.raw(topics):
@@ -222,6 +218,16 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
         finally:
             node.close()
     return counts
+
+
+def _publisher(node: RosNode, topic: str, kind: str) -> Any:
+    try:
+        return node.node.create_publisher(message_class(kind), PREFIX + topic, _DEPTH)
+    except InvalidTopicNameException as error:
+        reason = str(error).partition("\n")[0]
+        raise GymMaraError(
+            f"cannot replay the topic {short(topic, 80)} on {PREFIX}/…: {reason}"
+        ) from None
 
 
 def _sleep_until(instant: float) -> None:

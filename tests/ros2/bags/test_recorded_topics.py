@@ -1,17 +1,20 @@
-"""Which topics `gym-mara ros2 record` records: those of one arm, with a profile."""
+"""Which topics `gym-mara ros2 record` records, those of one arm with a profile, and which `replay` cannot publish."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 pytest.importorskip("rosbags")
 
+from rosbags.typesys.stores import ros2_jazzy as types
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from gym_mara.errors import GymMaraError
 from gym_mara.ros2 import messages
 from gym_mara.ros2.bags import recording
 from gym_mara.ros2.bags.bag import Bag, Recorder
@@ -127,3 +130,14 @@ def test_a_type_that_only_a_sourced_ros_has_is_recorded_by_its_definition(
         assert bag.topics == {"/mara_controller/state": CONTROLLER_STATE}
         (found,) = bag.raw(["/mara_controller/state"])
         assert "trajectory_msgs/JointTrajectoryPoint feedback" in str(found[0].msgdef.data)
+
+
+def test_a_bag_with_a_topic_that_is_none_of_ros_is_not_replayed(
+    tmp_path: Path, ros_domain: int
+) -> None:
+    with Recorder(tmp_path / "bag") as recorder:
+        layout = types.std_msgs__msg__MultiArrayLayout([], 0)
+        values = types.std_msgs__msg__Float64MultiArray(layout, np.zeros(1))
+        recorder.add_value("/joint_st!tes", values, 1)
+    with pytest.raises(GymMaraError, match=r"'/joint_st!tes' on /replay/…: .*topic name must"):
+        recording.replay(tmp_path / "bag")
