@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from gym_mara.errors import GymMaraError
+
 LIMIT = 20.0
 """How long a call may take, s; alone on a machine the slowest takes a few seconds."""
 _EPISODE_STEPS = 32
@@ -83,12 +85,19 @@ def _work(pipe: Connection) -> None:
 
 def _prepare() -> None:
     """Import what the commands import, and replace what would start processes or wait for a user."""
+    # What the first calls would import, for seconds.
+    import mujoco_warp  # noqa: F401
+    import plotly.graph_objects  # noqa: F401
+    import pyvista  # noqa: F401
+    import torch._dynamo  # noqa: F401
+
     from gym_mara import (
         cli,  # noqa: F401
         registration,
     )
     from gym_mara.agents.experiments import figures, local_executor, search  # noqa: F401
     from gym_mara.agents.experiments.executor import Job, OnMessage, failure_of
+    from gym_mara.agents.export import run  # noqa: F401
     from gym_mara.agents.inspection import report
     from gym_mara.agents.training.train import use_one_thread
     from gym_mara.viewer.viewer import Viewer
@@ -106,6 +115,30 @@ def _prepare() -> None:
     vars(report)["_VIDEO_SECONDS"] = 0.1
     setattr(Viewer, "run", interrupted)  # noqa: B010
     use_one_thread()
+    _wait_for_no_arm()
+
+
+def _wait_for_no_arm() -> None:
+    """Let the commands of ROS 2 wait for no arm, in a domain of this process on this machine, where there is none."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    with suppress(GymMaraError):
+        from gym_mara.backends import ros2
+        from gym_mara.ros2 import check, link
+        from gym_mara.ros2.bags import recording
+        from gym_mara.ros2.sim import node
+
+        for module, name in (
+            (ros2, "_CONNECTING"),
+            (check, "DISCOVERY"),
+            (check, "_WAITING"),
+            (link, "DISCOVERY"),
+            (node, "DISCOVERY"),
+            (recording, "DISCOVERY"),
+            (recording, "PATIENCE"),
+        ):
+            assert name in vars(module)
+            vars(module)[name] = 0.02
 
 
 def _run(arguments: list[str], folder: Path) -> tuple[object, str, list[str]]:

@@ -242,6 +242,8 @@ def test_an_option_of_rewards_without_effect_is_an_error(
         (["train", "--env", "MARA-v1"], "Did you mean 'MARA-v0'"),
         (["train", "--algo", "a3c"], "unknown algorithm 'a3c'"),
         (["train", "--backend", "gazebo"], "unknown backend 'gazebo'"),
+        (["train", "--backend", "ros2", "--preset", "tuned"], "with gym-mara ros2 deploy RUN"),
+        (["benchmark", "--backend", "ros2", "--out", "x"], "with gym-mara ros2 deploy RUN"),
         (["train", "--steps", "0.5"], "'--steps': must be a whole number"),
         (["train", "--steps", "nan"], "'--steps': must be a whole number"),
         (["train", "--steps", "1M"], "such as 300000 or 3e5, not '1M'"),

@@ -15,6 +15,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
@@ -25,6 +26,9 @@ from gym_mara.agents.export.run import export
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.cli.app import app
+from gym_mara.identification import Log
+from gym_mara.robot import RobotModel
+from gym_mara.ros2.bags.logs import write_episode
 from gym_mara.tasks import TASKS
 from tests.cli_worker import Ended, Worker
 
@@ -122,7 +126,7 @@ SETTINGS = ["kappa=0.5", "max_joint_velocity=1", "robot=ur5", "on_collision=term
 VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
-    "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
+    "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp", "ros2"],
     "policy": ["last", "best", "pretrained", "policy.onnx"],
     "start": ["run"],
     "from_policy": ["last", "best"],
@@ -153,16 +157,49 @@ VALID: dict[str, Sequence[str]] = {
     "record": ["new.csv"],
     "check": ["record.csv"],
     "settings": SETTINGS,
+    "target": ["-0.4,0.095,0.87", "5,0,0", "-0.4,0.1,0.7,0,1,0,0"],
+    "profile": ["trajectory", "forward", "action", "mara-2019"],
+    "controller": ["arm_controller"],
+    "namespace": ["left", "/left/arm"],
+    "robot": ["mara"],
+    "command_topic": ["/commands"],
+    "state_topic": ["states"],
+    "control_period": ["0.02"],
+    "rate": ["10"],
+    "as_json": ["new.json"],
+    "ros2 check.policy": ["policy.onnx"],
+    "ros2 check.seconds": ["0.5"],
+    "ros2 deploy.policy": ["policy.onnx", "pretrained", "run"],
+    "ros2 record.bag": ["new", "new", "bag"],
+    "ros2 record.topic": ["/joint_states"],
+    "ros2 replay.bag": ["bag"],
 }
+"""Values of a parameter by its name, or by those of the command and the parameter."""
 FORCED = {
     "train": ["steps"],
     "benchmark": ["env", "algo", "steps", "seeds", "out_folder"],
     "search": ["env", "algo", "steps", "trials", "seeds", "jobs", "out_folder"],
+    "ros2 check": ["seconds"],
+    "ros2 deploy": ["seconds"],
+    "ros2 record": ["seconds"],
+    "ros2 replay": ["rate"],
+    "ros2 sim": ["seconds"],
 }
-"""Options without which a call would train for long."""
+"""Options without which a call would train for long, or would not end."""
 RARE = ("report", "search", "benchmark")
 """Commands that take seconds even with the smallest numbers."""
-COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+
+
+def _commands(group: Any, before: str = "") -> dict[str, Any]:
+    """The commands of a group and of those in it, by their names with those of their groups."""
+    found: dict[str, Any] = {}
+    for name, command in group.commands.items():
+        inner = getattr(command, "commands", None)
+        found |= _commands(command, f"{before}{name} ") if inner else {before + name: command}
+    return found
+
+
+COMMANDS = _commands(typer.main.get_command(app))
 
 
 def arguments_of(choose: random.Random) -> list[str]:
@@ -173,15 +210,15 @@ def arguments_of(choose: random.Random) -> list[str]:
     name = choose.choice(usual if choose.random() < 0.93 else RARE)
     forced = FORCED.get(name, [])
     hostile = choose.choice([0.0, 0.15, 0.5])
-    call = [name]
+    call = name.split()
     for parameter in COMMANDS[name].params:
         if parameter.param_type_name == "argument":
             if choose.random() < 0.95:
-                call.append(_value(parameter, choose, hostile))
+                call.append(_value(name, parameter, choose, hostile))
         elif parameter.name in forced or choose.random() < 0.25:
             call.append(parameter.opts[0])
             if not parameter.is_flag:
-                call.append(_value(parameter, choose, hostile))
+                call.append(_value(name, parameter, choose, hostile))
     if "--resume" in call and choose.random() < 0.7:
         call = ["train", "--resume", call[call.index("--resume") + 1]]
     if "--video" in call:
@@ -190,9 +227,10 @@ def arguments_of(choose: random.Random) -> list[str]:
     return call
 
 
-def _value(parameter: Any, choose: random.Random, hostile: float) -> str:
-    if choose.random() > hostile and parameter.name in VALID:
-        return choose.choice(VALID[parameter.name])
+def _value(command: str, parameter: Any, choose: random.Random, hostile: float) -> str:
+    valid = VALID.get(f"{command}.{parameter.name}") or VALID.get(parameter.name)
+    if choose.random() > hostile and valid:
+        return choose.choice(valid)
     if parameter.name == "settings":
         return f"{choose.choice(KEYWORDS)}={choose.choice(VALUES)}"
     if parameter.metavar in ("N", "X"):
@@ -204,7 +242,7 @@ def _value(parameter: Any, choose: random.Random, hostile: float) -> str:
 
 @pytest.fixture(scope="session")
 def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run, its exported policy, a finished grid of one run, and a record of rewards."""
+    """A finished run, its exported policy, a finished grid of one run, a record of rewards, and a bag."""
     folder = Path(tmp_path_factory.mktemp("fuzz"))
     train(
         RunConfig("MARA-v0", "ppo", "pinocchio", 512, 0),
@@ -221,18 +259,22 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     assert run_grid(folder / "grid", grid, run_here, lambda name, message: None) == {}
     regression.write(folder / "record.csv", regression.record("MARA-v0", "pinocchio", {}, 8))
+    robot = RobotModel.load("mara")
+    q = np.tile(robot.home, (25, 1))
+    log = Log(np.arange(25) * np.float64(0.1), q, q, np.zeros_like(q), robot.joint_names)
+    write_episode(folder / "bag", log, robot)
     return folder
 
 
 def prepare(folder: Path, originals: Path, call: list[str], choose: random.Random) -> None:
-    """Make the files that a call may find: a run, a policy, a grid and a record, perhaps damaged, and unusual files."""
+    """Make the files that a call may find: a run, a policy, a grid, a record and a bag, perhaps damaged, and unusual files."""
     folder.mkdir()
     (folder / "folder").mkdir()
     (folder / "folder" / "bystander").write_text("mine")
     (folder / "existing").write_text("mine")
     os.mkfifo(folder / "fifo")
     (folder / "loop").symlink_to("loop")
-    for name in ("run", "policy.onnx", "grid", "record.csv"):
+    for name in ("run", "policy.onnx", "grid", "record.csv", "bag"):
         if name in call:
             source = originals / name
             (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -13,6 +14,7 @@ from gym_mara.errors import GymMaraError, flag, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.ros2.arm import ArmState, Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError, Driver
+from gym_mara.ros2.profiles import make_profile
 from gym_mara.ros2.safety.filter import SafetyFilter, Watchdogs
 from gym_mara.ros2.safety.motion import MotionLimits
 from gym_mara.state import SimState
@@ -23,11 +25,14 @@ _RESET_SPEED = 0.25
 _ARRIVED = 0.01
 """How near each joint comes to a start pose, rad (m)."""
 _STILL = 0.05
-"""The largest velocity of a joint at rest, rad/s (m/s)."""
+"""The largest velocity of a joint that has arrived there, rad/s (m/s), unless `rest_velocity` is larger."""
 _CONNECTING = 5.0
 """How long the first state of the arm may take, s."""
-_RESET_TIME = 60.0
-"""How long a motion to a start pose takes at most, s."""
+_RESET_TIME = 1.5
+"""How much longer than by the limits a motion to a start pose takes at most."""
+_ARRIVAL_TIME = 5.0
+"""How much longer still, s: an arm follows its set-points late, and comes to rest."""
+_INTERRUPTED = "the motion to the start pose was interrupted"
 
 
 class Ros2Backend(Backend):
@@ -47,12 +52,14 @@ class Ros2Backend(Backend):
         namespace: of the arm's topics, such as "/left".
         domain: the ROS domain; by default that of the environment variable ROS_DOMAIN_ID, or 0.
         live: whether the arm moves. Without it nothing is sent, and the arm stays where it is.
-        max_joint_velocity: rad/s (m/s), where it is below the robot's limits.
+        max_joint_velocity: rad/s (m/s), where it is below the robot's limits. With the profile "mara-2019" it is the velocity in the
+            points, too, with which each servo moves there; by default 0.5 there.
         max_joint_acceleration: rad/s² (m/s²); by default the velocity is reached in 0.2 s.
         max_joint_jerk: rad/s³ (m/s³); by default the acceleration is reached in 0.1 s.
         setpoint_period: the time between two set-points, s.
         command_age: the arm stops if no action has come for so long, s. A training that pauses to learn needs more.
         tracking_error: the arm stops if a joint is so far from its set-point, rad (m).
+        rest_velocity: the arm starts and resumes only while no joint is measured to be faster, rad/s (m/s). Noisy encoders need more.
         collision: the collision engine, as of the backend "pinocchio".
 
     Raises:
@@ -82,24 +89,37 @@ class Ros2Backend(Backend):
         setpoint_period: float = 0.01,
         command_age: float = 0.2,
         tracking_error: float = 0.2,
+        rest_velocity: float = 0.02,
         collision: str = "coal",
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        limits = MotionLimits.of(robot, max_joint_velocity, max_joint_acceleration, max_joint_jerk)
-        self.joint_velocity = limits.velocity
+        own = make_profile(profile, controller=controller, namespace=namespace).velocity
+        fastest = own if max_joint_velocity is None else max_joint_velocity
+        limits = MotionLimits.of(robot, fastest, max_joint_acceleration, max_joint_jerk)
+        self._limits, self.joint_velocity = limits, limits.velocity
         self._checker = make_checker(collision, robot)
         self._kinematics = robot.kinematics()
         period = positive_number("setpoint_period", setpoint_period, "s", at_most=control_period)
-        watchdogs = Watchdogs(command_age=command_age, tracking_error=tracking_error)
+        watchdogs = Watchdogs(
+            command_age=command_age, tracking_error=tracking_error, rest_velocity=rest_velocity
+        )
         safety = SafetyFilter(robot, period, limits, watchdogs, make_checker(collision, robot))
         live = flag("live", live)
         link, clock = self._connect(
-            profile, controller=controller, namespace=namespace, domain=domain, commands=live
+            profile,
+            controller=controller,
+            namespace=namespace,
+            # The servos are as fast as the points say, and shall follow.
+            velocity=None if own is None else float(limits.velocity.max()),
+            domain=domain,
+            commands=live,
         )
         self.clock: Clock = clock
         """Sets the pace."""
         self.driver = Driver(link, safety, self.clock, live=live)
         """Moves the arm."""
+        self.interrupted: Callable[[], bool] = lambda: False
+        """Whether a motion to a start pose shall end before it arrives; then the arm stops, and `reset` raises ArmStoppedError."""
         self._began = self._due = self.clock.now()
         self._lateness = self._missed = 0.0
         try:
@@ -149,19 +169,24 @@ class Ros2Backend(Backend):
             except ArmStoppedError:
                 raise
             except BaseException:
-                self.driver.stop("the motion to the start pose was interrupted")
+                self.driver.stop(_INTERRUPTED)
                 raise
             finally:
                 self.driver.safety.speed = 1.0
 
     def _wait_at(self, goal: Floats) -> None:
-        end = self.clock.now() + _RESET_TIME
+        # An arm that still moves brakes before, and returns.
+        least = self._limits.duration(goal - self._reported().q, _RESET_SPEED)
+        allowed = _RESET_TIME * (least + 3.0 * self.driver.safety.longest_stop) + _ARRIVAL_TIME
+        end = self.clock.now() + allowed
         while not self._rests_at(goal):
-            if self.clock.now() > end:
+            if self.interrupted():
+                self.driver.stop(_INTERRUPTED)
+            elif self.clock.now() > end:
                 off = np.abs(self._reported().q - goal)
                 joint = int(off.argmax())
                 raise GymMaraError(
-                    f"the arm has not reached the start pose within {_RESET_TIME:g} s: joint {self.robot.joint_names[joint]} is "
+                    f"the arm has not reached the start pose within {allowed:.3g} s: joint {self.robot.joint_names[joint]} is "
                     f"{off[joint]:.3g} rad (m) away; is its controller active, and does it follow?"
                 )
             self.driver.command(goal)
@@ -169,7 +194,8 @@ class Ros2Backend(Backend):
 
     def _rests_at(self, goal: Floats) -> bool:
         state = self._reported()
-        near, still = np.abs(state.q - goal) < _ARRIVED, np.abs(state.qd) < _STILL
+        slow = max(_STILL, self.driver.safety.watchdogs.rest_velocity)
+        near, still = np.abs(state.q - goal) < _ARRIVED, np.abs(state.qd) < slow
         return bool(near.all() and still.all())
 
     def step(self, q_target: Floats) -> SimState:

@@ -53,7 +53,12 @@ class OnnxPolicy:
             raise DamagedFileError(
                 f"cannot read {str(file)!r}: onnxruntime does not take it for an ONNX model ({error})"
             ) from error
-        text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        try:
+            text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        except UnicodeDecodeError as error:
+            raise DamagedFileError(
+                f"cannot read {str(file)!r}: its metadata are not UTF-8 ({error})"
+            ) from None
         if text is None:
             raise DamagedFileError(
                 f"cannot read {str(file)!r}: it has no metadata of gym_mara; export the policy with gym-mara export"

@@ -207,6 +207,7 @@ class Deployment:
             GymMaraError: the arm cannot be driven any more.
         """
         end = np.inf if seconds is None else self._clock.now() + seconds
+        self.backend.interrupted = lambda: self._over(end)
         while not self._over(end):
             try:
                 self._driver.check()

@@ -36,6 +36,17 @@ DISCOVERY = 0.5
 _POLL = 0.05
 
 
+def installed(profile: Profile) -> tuple[Profile, tuple[str, ...]]:
+    """A profile with the messages that are installed, and in what it differs from the one given."""
+    if profile.states != "controller_state" or messages.control_msgs_installed():
+        return profile, ()
+    replaced = profile.with_joint_states()
+    return replaced, (
+        f"control_msgs is not installed, so the states come from {replaced.state_topic} (sensor_msgs/JointState) and not from "
+        f"{profile.state_topic}",
+    )
+
+
 class RosLink:
     """The connection to one arm; see `gym_mara.ros2.arm.Link`.
 
@@ -44,7 +55,7 @@ class RosLink:
     Args:
         robot: the arm.
         profile: in which form it takes commands and reports states, and on which topics; or the name of a profile.
-        controller, namespace: of a profile that is given by its name; see `make_profile`.
+        controller, namespace, velocity: of a profile that is given by its name; see `make_profile`.
         node: the node to use, which is not closed with the link; by default one of its own.
         domain: the ROS domain of a node of its own; by default that of ROS_DOMAIN_ID, or 0.
         commands: whether commands will be sent. Without, no publisher of commands is made, which others would see.
@@ -61,27 +72,21 @@ class RosLink:
         *,
         controller: str | None = None,
         namespace: str = "",
+        velocity: float | None = None,
         node: RosNode | None = None,
         domain: int | None = None,
         commands: bool = True,
     ) -> None:
-        if isinstance(profile, Profile) and (controller is not None or namespace):
+        if isinstance(profile, Profile) and (namespace or (controller, velocity) != (None, None)):
             raise GymMaraError(
-                "a Profile has its topics: give controller and namespace to make_profile"
+                "a Profile has its topics: give controller, namespace and velocity to make_profile"
             )
         own = profile
         if not isinstance(own, Profile):
-            own = make_profile(own, controller=controller, namespace=namespace)
+            own = make_profile(own, controller=controller, namespace=namespace, velocity=velocity)
         own.check(robot.joint_names)
-        self.notes: tuple[str, ...] = ()
+        own, self.notes = installed(own)
         """In what the connection differs from its profile."""
-        if own.states == "controller_state" and not messages.control_msgs_installed():
-            replaced = own.with_joint_states()
-            self.notes = (
-                f"control_msgs is not installed, so the states come from {replaced.state_topic} (sensor_msgs/JointState) and not "
-                f"from {own.state_topic}",
-            )
-            own = replaced
         action = messages.follow_joint_trajectory_type() if own.commands == "action" else None
         self.robot, self.profile = robot, own
         self._lock = threading.Lock()

@@ -16,8 +16,12 @@ States = Literal["joint_states", "controller_state"]
 
 JOINT_STATES = "joint_states"
 """The topic of ros2_control's joint_state_broadcaster."""
+DESCRIPTION = "robot_description"
+"""The topic of the URDF."""
 MARA_VELOCITY = 0.5
 """The velocity that gym-gazebo2 commands by default, rad/s."""
+LONGEST_TOPIC = 200
+"""The longest name of a topic, characters: DDS allows some more, of which ROS needs some itself."""
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
@@ -72,9 +76,18 @@ class Profile:
         """This profile with sensor_msgs/JointState as the states, for where control_msgs is not installed."""
         if self.states == "joint_states":
             return self
-        namespace = self.command_topic.rsplit("/", 2)[0]
-        topic = f"{namespace}/{JOINT_STATES}"
+        topic = f"{self._namespace}/{JOINT_STATES}"
         return dataclasses.replace(self, states="joint_states", state_topic=topic)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics of the arm: states, commands and the description. The goals of an action are on none."""
+        commands = () if self.commands == "action" else (self.command_topic,)
+        return (self.state_topic, *commands, f"{self._namespace}/{DESCRIPTION}")
+
+    @property
+    def _namespace(self) -> str:
+        return self.command_topic.rsplit("/", 2)[0]
 
 
 _MARA_JOINTS = ("motor1", "motor2", "motor3", "motor4", "motor5", "motor6")
@@ -170,5 +183,9 @@ def _topic(what: str, given: str | None, *parts: str) -> str:
         raise GymMaraError(
             f"{what} {short(topic, 200)} is no name of ROS: it needs letters, digits and underscores between slashes, with no "
             "digit first and no two underscores together, such as /arm/joint_states; check controller and namespace too"
+        )
+    if len(topic) > LONGEST_TOPIC:
+        raise GymMaraError(
+            f"{what} has {len(topic)} characters with controller and namespace, and may have {LONGEST_TOPIC}: {short(topic, 80)}"
         )
     return topic

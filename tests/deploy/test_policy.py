@@ -272,6 +272,13 @@ def test_a_model_without_metadata_is_an_error(tmp_path: Path) -> None:
         OnnxPolicy(write_model(tmp_path / "policy.onnx", made))
 
 
+def test_a_model_with_metadata_in_another_encoding_is_an_error(tmp_path: Path) -> None:
+    file = write_model(tmp_path / "policy.onnx", model(about()))
+    file.write_bytes(file.read_bytes().replace(b'"rad"', b'"r\xb4d"', 1))
+    with pytest.raises(DamagedFileError, match=r"policy\.onnx': its metadata are not UTF-8"):
+        OnnxPolicy(file)
+
+
 @pytest.mark.parametrize("text", ["", "{}", about().to_json().replace('"rad"', "5")])
 def test_a_model_with_damaged_metadata_is_an_error(tmp_path: Path, text: str) -> None:
     made = model(about())

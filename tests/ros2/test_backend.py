@@ -15,7 +15,7 @@ from gym_mara.backends import backend_names, make_backend, registry, simulated_b
 from gym_mara.envs import make_vector_env
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
-from gym_mara.ros2.arm import Clock, Link, WallClock
+from gym_mara.ros2.arm import ArmState, Clock, Link, WallClock
 from gym_mara.ros2.driver import ArmStoppedError
 from tests.helpers import PATH_ENDS
 from tests.ros2.fake import FakeArm, FakeClock, FakeRos2Backend
@@ -92,6 +92,29 @@ def test_reset_moves_slowly_to_the_start_pose_and_ends_at_rest(make: Make) -> No
     speeds = np.array([s.qd for s in backend.arm.sent])
     assert (np.abs(speeds) <= 0.25 * backend.joint_velocity + 1e-6).all()
     assert state.time[0] == 0.0
+
+
+@pytest.mark.parametrize("fastest", [None, 0.05])
+def test_a_reset_takes_as_long_as_its_way_at_a_low_speed(make: Make, fastest: float | None) -> None:
+    backend = make(max_joint_velocity=fastest, max_joint_acceleration=1.0)
+    before = backend.clock.now()
+    backend.reset(backend.state.q + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
+    least = 1.0 / (0.25 * backend.joint_velocity[0])
+    assert abs(backend.clock.now() - before - least) < 2.0
+    if fastest:
+        assert least > 60.0
+
+
+def test_an_arm_that_does_not_arrive_is_an_error_soon(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = make(tracking_error=10.0)
+    backend.arm.follows = False
+    before = backend.clock.now()
+    with pytest.raises(GymMaraError, match=r"within .* s: joint motor1 is 0\.2 rad"):
+        backend.reset(backend.state.q + 0.2)
+    assert 5.0 < backend.clock.now() - before < 8.0
+    assert "interrupted" in (backend.driver.safety.reason or "")
 
 
 def test_reset_refuses_a_start_pose_behind_an_obstacle(robot: RobotModel) -> None:
@@ -240,6 +263,48 @@ def test_an_arm_that_does_not_follow_stops(make: Make) -> None:
     backend.arm.follows = False
     with pytest.raises(ArmStoppedError, match="does not follow"):
         _steps(backend, 100)
+
+
+def test_an_arm_with_noisy_encoders_starts_and_arrives(
+    robot: RobotModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noise = np.random.default_rng(0)
+
+    def noisy(arm: FakeArm) -> ArmState:
+        qd = arm.qd + noise.uniform(-0.09, 0.09, len(arm.qd))
+        return ArmState(arm.q.copy(), qd, None, arm.clock.now(), arm.clock.now())
+
+    monkeypatch.setattr(FakeArm, "state", property(noisy))
+    with pytest.raises(GymMaraError, match="rest_velocity"):
+        FakeRos2Backend(robot, 1, live=True)
+    backend = FakeRos2Backend(robot, 1, live=True, rest_velocity=0.1)
+    before = backend.clock.now()
+    backend.reset(backend.state.q + 0.2)
+    assert backend.clock.now() - before < 2.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "speed", "in_points"),
+    [
+        ({"profile": "mara-2019"}, 0.5, 0.5),
+        ({"profile": "mara-2019", "max_joint_velocity": 0.3}, 0.3, 0.3),
+        ({"profile": "mara-2019", "max_joint_velocity": 9.0}, 1.57, 1.57),
+        ({}, 1.57, None),
+    ],
+)
+def test_the_servos_of_2019_are_commanded_no_faster_than_their_points_say(
+    robot: RobotModel, settings: dict[str, Any], speed: float, in_points: float | None
+) -> None:
+    class Noted(FakeRos2Backend):
+        def _connect(self, profile: str, **options: Any) -> tuple[Link, Clock]:
+            assert options["velocity"] == in_points
+            return super()._connect(profile, **options)
+
+    backend = Noted(robot, 1, live=True, **settings)
+    backend.reset(backend.state.q)
+    for _ in range(100):
+        backend.step(backend.state.q + 1.0)
+    assert np.abs([sent.qd for sent in backend.arm.sent]).max() == pytest.approx(speed)
 
 
 def test_a_learner_that_pauses_leaves_the_arm_at_rest_at_its_last_target(make: Make) -> None:

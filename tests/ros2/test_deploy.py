@@ -203,6 +203,31 @@ def test_an_end_is_an_end(deploy: Callable[..., Deployment]) -> None:
     deployment.run()
 
 
+@pytest.mark.parametrize("how", ["end", "seconds"])
+def test_an_end_is_one_on_the_way_back_to_the_start_too(
+    deploy: Callable[..., Deployment], monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    deployment = deploy(on_collision="reset", max_joint_velocity=0.2)
+    clock, start = _clock(deployment), _arm(deployment).q.copy()
+    deployment.aim(NEAR).result()
+    began, wait, collisions = clock.time, clock.sleep_until, [start]
+
+    def ahead(_: object) -> Any:
+        return collisions.pop() if clock.time > began + 4.0 and collisions else None
+
+    def sleep_until(instant: float) -> None:
+        wait(instant)
+        if how == "end" and clock.time > began + 6.0:
+            deployment.end()
+
+    monkeypatch.setattr(deployment.backend.driver.safety._paths, "first_collision", ahead)
+    monkeypatch.setattr(clock, "sleep_until", sleep_until)
+    deployment.run(6.0 if how == "seconds" else None)
+    assert began + 6.0 <= clock.time < began + 6.1
+    assert deployment.diagnostics.status == "stopped: the motion to the start pose was interrupted"
+    assert np.abs(_arm(deployment).q - start).max() > 0.05, "it was on its way"
+
+
 def test_a_policy_of_another_robot_is_refused(deploy: Callable[..., Deployment]) -> None:
     with pytest.raises(GymMaraError, match=r"another|moves the joints"):
         deploy(robot="ur5")

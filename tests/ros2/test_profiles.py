@@ -47,6 +47,14 @@ def test_a_name_that_is_none_of_ros_is_refused(name: str) -> None:
         make_profile(command_topic=name)
 
 
+def test_a_topic_that_is_too_long_is_refused() -> None:
+    assert len(make_profile(command_topic="/" + "n" * 199).command_topic) == 200
+    with pytest.raises(GymMaraError, match=r"has 201 characters.* may have 200"):
+        make_profile(command_topic="/" + "n" * 200)
+    with pytest.raises(GymMaraError, match="with controller and namespace"):
+        make_profile(namespace="n" * 3000)
+
+
 def test_a_bad_namespace_is_refused() -> None:
     with pytest.raises(GymMaraError, match="namespace"):
         make_profile(namespace="left arm")

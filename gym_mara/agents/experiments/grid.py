@@ -17,6 +17,7 @@ from typing_extensions import TypedDict
 
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import Executor, OnMessage, Send
+from gym_mara.agents.runs.config import check_backend
 from gym_mara.agents.runs.evaluation import evaluate_run
 from gym_mara.agents.runs.folder import (
     POLICIES,
@@ -27,7 +28,7 @@ from gym_mara.agents.runs.folder import (
 )
 from gym_mara.agents.training.callbacks import OnProgress
 from gym_mara.agents.training.train import resume, train
-from gym_mara.backends import DEFAULT_BACKEND, backend_names
+from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.files import (
     DamagedFileError,
@@ -69,8 +70,7 @@ class Grid:
                 raise unknown("environment", env, environment_names())
         for algo in self.algos:
             algorithm(algo).presets_of(self.preset_name)
-        if self.backend not in backend_names():
-            raise unknown("backend", self.backend, backend_names())
+        check_backend(self.backend)
         for kind, names in (("environment", self.envs), ("algorithm", self.algos)):
             if not names:
                 raise GymMaraError(f"a grid needs at least one {kind}")

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NoReturn
 
 from gym_mara.agents.algorithms.base import Preset, plain_values
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET
-from gym_mara.errors import GymMaraError, short
+from gym_mara.backends import backend_names, simulated_backends
+from gym_mara.errors import GymMaraError, short, unknown
 from gym_mara.files import DamagedFileError, parsed_json, read_json
 from gym_mara.rendering import RenderSettings
 from gym_mara.robot.options import with_paths
@@ -137,6 +138,23 @@ def read_config(file: Path) -> RunConfig:
 def config_values(config: RunConfig, versions: dict[str, str]) -> dict[str, Any]:
     """The JSON values of a configuration."""
     return {**dataclasses.asdict(config), "versions": versions}
+
+
+def check_backend(name: str) -> None:
+    """Check that a run can be trained on a backend.
+
+    Raises:
+        GymMaraError: it is unknown, or it moves a real arm.
+    """
+    if name not in backend_names():
+        raise unknown("backend", name, backend_names())
+    if name not in simulated_backends():
+        raise GymMaraError(
+            f"no run can be trained on the backend {name!r}: a run needs arms that are evaluated beside those that learn, and "
+            f"snapshots of them, and this is one arm in real time. Train on another backend ({', '.join(simulated_backends())}) and "
+            "play the policy on the arm with gym-mara ros2 deploy RUN; or let Stable-Baselines3 itself learn on "
+            "gym_mara/MARAReal-v0, one arm, as docs/ros2.md shows"
+        )
 
 
 def check_options(options: dict[str, Any], *, pictures: bool) -> None:

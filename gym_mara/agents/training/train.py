@@ -32,6 +32,7 @@ from gym_mara.agents.algorithms.registry import (
     DEFAULT_PRESET,
     algorithm,
 )
+from gym_mara.agents.runs.config import check_backend
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
 from gym_mara.agents.runs.policy import base_env, policy_arguments
@@ -60,6 +61,7 @@ def train(
         TrainingDivergedError: the agent's parameters are no longer finite.
     """
     algorithm(config.algo)  # an unknown name is an error before anything is built
+    check_backend(config.backend)
     config = replace(config, preset=asdict(preset or preset_of(config)))
     model = new_model(config)  # if this fails, no folder is made
     if config.start is not None:

@@ -9,6 +9,8 @@ import typer
 from gym_mara.cli.common import one_of, whole
 from gym_mara.ros2.profiles import PROFILES, Profile, make_profile
 
+profile_name = one_of("profile", lambda: PROFILES)
+
 RobotOption = Annotated[
     str,
     typer.Option(metavar="ROBOT", help="A URDF, or the name of a robot that gym-mara list shows."),
@@ -22,7 +24,7 @@ DomainOption = Annotated[
 ProfileOption = Annotated[
     str,
     typer.Option(
-        parser=one_of("profile", lambda: PROFILES),
+        parser=profile_name,
         metavar="NAME",
         help="How to speak to the arm: " + ", ".join(PROFILES) + ".",
     ),

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from gym_mara.backends import make_backend
-from gym_mara.cli.common import backend_name, interruptible, keyword_arguments, number, out
+from gym_mara.backends import make_backend, simulated_backends
+from gym_mara.cli.common import interruptible, keyword_arguments, number, one_of, out
 from gym_mara.cli.ros2.options import DomainOption, RobotOption
 from gym_mara.robot import RobotModel, RobotOptions
 from gym_mara.state import SimState
@@ -19,7 +19,11 @@ def sim(
     robot: RobotOption = "mara",
     backend: Annotated[
         str,
-        typer.Option(parser=backend_name, metavar="NAME", help="Backend; gym-mara list shows all."),
+        typer.Option(
+            parser=one_of("backend", simulated_backends),
+            metavar="NAME",
+            help="Backend that simulates; gym-mara list shows all.",
+        ),
     ] = "dart",
     settings: Annotated[
         list[str],

@@ -18,7 +18,7 @@ from gym_mara.files import DamagedFileError, MissingFileError, plain_size, read_
 with needs("bags", "ros2", "rosbags"):
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 LARGEST = 2**31
 """The largest file of a bag that is read, bytes."""
@@ -193,6 +193,15 @@ class Recorder:
     def knows(self, kind: str) -> bool:
         """Whether messages of this type can be recorded: those whose definition is known."""
         return kind in self._types.fielddefs
+
+    def define(self, kind: str, definition: str) -> bool:
+        """Take the definition of a type, the text of its file .msg; returns whether its messages can be recorded now."""
+        try:
+            self._types.register(get_types_from_msg(definition, kind))
+            self._types.generate_msgdef(kind, ros_version=2)
+        except Exception:  # it is no definition, or one with types that are unknown too
+            self._types.fielddefs.pop(kind, None)
+        return self.knows(kind)
 
     def add(self, topic: str, kind: str, data: bytes, stamp: int) -> None:
         """Write a serialised message.

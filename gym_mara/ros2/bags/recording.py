@@ -7,16 +7,25 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, short
+from gym_mara.files import read_text
+from gym_mara.robot import RobotModel
+from gym_mara.ros2 import messages
 from gym_mara.ros2.bags.bag import Bag, Recorder
-from gym_mara.ros2.link import DISCOVERY
+from gym_mara.ros2.bags.logs import STATE_TYPE
+from gym_mara.ros2.deploy_node import DIAGNOSTICS, TARGET
+from gym_mara.ros2.link import DISCOVERY, installed
 from gym_mara.ros2.node import RosNode, needs_ros
+from gym_mara.ros2.profiles import DESCRIPTION, Profile
 
 with needs_ros("recording and replaying topics"):
+    from ament_index_python.packages import get_package_share_path
+    from rclpy.exceptions import InvalidTopicNameException
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 KINDS = (
@@ -33,6 +42,8 @@ _POLL = 0.1
 PATIENCE = 10.0
 """How long the first message is waited for, s."""
 _DEPTH = 1000
+_LOOKED_AT = 1000
+"""In how many states `lacking_joints` looks for joints."""
 _Arrived = tuple[str, str, bytes, int]
 """The topic, the type, the serialised message and the time, ns."""
 
@@ -52,6 +63,14 @@ def message_class(kind: str) -> Any:
         ) from error
 
 
+def topics_of(profile: Profile) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The topics of an arm and of a policy that is deployed on it; and what is recorded otherwise than the profile says, or not."""
+    own, notes = installed(profile)
+    if own.commands == "action":
+        notes += (f"the goals of the action {own.command_topic} are on no topic: not recorded",)
+    return (*own.topics, TARGET, DIAGNOSTICS), notes
+
+
 def record(
     folder: Path,
     topics: Sequence[str] = (),
@@ -59,12 +78,14 @@ def record(
     *,
     domain: int | None = None,
 ) -> dict[str, int]:
-    """Record topics until the duration is over or the process is interrupted; returns how many messages each has.
+    """Record topics until the duration is over or the process is interrupted; returns how many messages each has. A topic that
+    was named and has not appeared is not in there.
 
     Args:
         folder: a new folder for the bag.
         topics: their names; all of `KINDS` if none is given. They may appear later.
-        duration: from the first message on, s, which is waited for at most PATIENCE longer; None for no end.
+        duration: from the first message on, but for a robot's description, s, which is waited for at most PATIENCE longer; None
+            for no end.
         domain: the ROS domain; by default that of ROS_DOMAIN_ID, or 0.
 
     Raises:
@@ -86,15 +107,34 @@ def record(
                         _subscribe(node, recorder, topics, subscribed, arrived)
                         look = now + _POLL
                     _drain(recorder, arrived, min(_POLL, end - now))
-                    if duration is not None and recorder.counts and recording is None:
+                    if duration is not None and recording is None and _moves(recorder):
                         recording = time.monotonic()
                         end = recording + duration
             except KeyboardInterrupt:
                 pass  # which is how a recording ends
             _drain(recorder, arrived, 0.0)
-            return dict(recorder.counts)
+            return {**{name: 0 for name in topics if name in subscribed}, **recorder.counts}
     finally:
         node.close()
+
+
+def lacking_joints(folder: Path, topic: str, robot: RobotModel) -> list[str]:
+    """The joints of a robot that none of the first states of a topic has; none if it has no sensor_msgs/JointState."""
+    with Bag(folder) as bag:
+        if bag.topics.get(topic) != STATE_TYPE:
+            return []
+        states = islice(bag.messages([topic]), _LOOKED_AT)
+        there = {name for state in states for name in state.value.name}
+    return [name for name in robot.joint_names if name not in there]
+
+
+def _is_description(topic: str) -> bool:
+    return topic.endswith(f"/{DESCRIPTION}")
+
+
+def _moves(recorder: Recorder) -> bool:
+    """Whether a message has come that does not come to everybody at once."""
+    return not all(map(_is_description, recorder.counts))
 
 
 def _drain(recorder: Recorder, arrived: SimpleQueue[_Arrived], patience: float) -> None:
@@ -118,7 +158,7 @@ def _subscribe(
         if topic in known or not wanted or topic.startswith(f"{PREFIX}/"):
             continue
         known.add(topic)
-        if len(kinds) != 1 or not recorder.knows(kinds[0]):
+        if len(kinds) != 1 or not (recorder.knows(kinds[0]) or _define(recorder, kinds[0])):
             raise GymMaraError(
                 f"{topic} has messages {', '.join(kinds)}, which cannot be recorded: name other topics"
             )
@@ -127,7 +167,19 @@ def _subscribe(
             arrived.put((topic, kind, data, time.time_ns()))
 
         quality = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        if _is_description(topic):  # it was published before, once
+            quality = messages.LATCHED
         node.node.create_subscription(message_class(kinds[0]), topic, put, quality, raw=True)
+
+
+def _define(recorder: Recorder, kind: str) -> bool:
+    """Give a recorder the definition of a type that this ROS has, such as those of control_msgs; returns whether there is one."""
+    package, folder, name = kind.split("/")
+    try:
+        definition = read_text(get_package_share_path(package) / folder / f"{name}.msg")
+    except (LookupError, OSError, GymMaraError):
+        return False
+    return recorder.define(kind, definition)
 
 
 def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[str, int]:
@@ -142,7 +194,7 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
 
     Raises:
         DamagedFileError: the bag is missing or damaged.
-        GymMaraError: it has no message that can be published.
+        GymMaraError: it has no message that can be published, or a topic with a name that is none of ROS.
         MissingExtraError: ROS or `rosbags` is not installed.
     """
     with Bag(path) as bag:
@@ -154,12 +206,7 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
         counts = dict.fromkeys(topics, 0)
         node = RosNode("gym_mara_replay", domain=domain)
         try:
-            publishers = {
-                topic: node.node.create_publisher(
-                    message_class(bag.topics[topic]), PREFIX + topic, _DEPTH
-                )
-                for topic in topics
-            }
+            publishers = {topic: _publisher(node, topic, bag.topics[topic]) for topic in topics}
             time.sleep(DISCOVERY)
             begin, first = time.monotonic(), None
             for connection, stamp, data in bag.raw(topics):
@@ -171,6 +218,16 @@ def replay(path: Path, rate: float = 1.0, *, domain: int | None = None) -> dict[
         finally:
             node.close()
     return counts
+
+
+def _publisher(node: RosNode, topic: str, kind: str) -> Any:
+    try:
+        return node.node.create_publisher(message_class(kind), PREFIX + topic, _DEPTH)
+    except InvalidTopicNameException as error:
+        reason = str(error).partition("\n")[0]
+        raise GymMaraError(
+            f"cannot replay the topic {short(topic, 80)} on {PREFIX}/…: {reason}"
+        ) from None
 
 
 def _sleep_until(instant: float) -> None:

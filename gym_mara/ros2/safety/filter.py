@@ -32,8 +32,6 @@ RAMP_START = 0.1
 """The share of the velocity limit with which a motion begins."""
 LOWEST_SPEED = 0.01
 """The smallest share of the velocity limits that can be set."""
-AT_REST = 0.02
-"""An arm rests while no joint is faster than this, rad/s (m/s): what is measured at rest is never exactly zero."""
 OVERSHOOT = 1e-3
 """A joint at its end stop may be measured so far beyond its limit, rad (m)."""
 
@@ -66,7 +64,7 @@ class SafetyFilter:
         robot: the arm.
         period: the time between two ticks, s.
         limits: of the motion.
-        watchdogs: what else stops the arm.
+        watchdogs: what else stops the arm, and how still it must be to start.
         checker: finds collisions; None for no such checks.
 
     Raises:
@@ -275,10 +273,10 @@ class SafetyFilter:
         if isinstance(velocity, str):
             raise GymMaraError(f"the arm's velocity {velocity}")
         fastest = int(np.abs(velocity).argmax())
-        if abs(velocity[fastest]) > AT_REST:
+        if abs(velocity[fastest]) > (allowed := self.watchdogs.rest_velocity):
             raise GymMaraError(
                 f"the arm moves: {robot.joint_names[fastest]} at {velocity[fastest]:.3g} rad/s (m/s); it can start only at rest, "
-                f"below {AT_REST:g}"
+                f"below {allowed:g}; if it rests and its encoders are noisy, give a larger rest_velocity"
             )
         measured = self._guard.numbers(state.q)
         if not isinstance(measured, str):

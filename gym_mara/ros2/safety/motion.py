@@ -95,6 +95,22 @@ class MotionLimits:
             )
         return cls(velocity, acceleration, jerk)
 
+    def duration(self, way: Floats, share: float = 1.0) -> float:
+        """The time of a straight motion from rest to rest, s; an upper bound where it is too short to reach all limits.
+
+        It is L/v + v/a + a/j, of a profile with seven phases of constant jerk on a line of the length L.
+
+        Args:
+            way: of each joint (J,), rad (m).
+            share: the velocity limit, as a share of the full one.
+        """
+        # The inverse limits on the line, whose length is 1: that of the joint that is limited most.
+        v, a, j = (
+            float((np.abs(way) / limit).max())
+            for limit in (share * self.velocity, self.acceleration, self.jerk)
+        )
+        return v + a / v + j / a if v else 0.0
+
 
 class Motion:
     """A moving set-point, and the proved stop from it.

@@ -12,10 +12,12 @@ import numpy as np
 from gym_mara.errors import positive_number
 from gym_mara.ros2.arm import ArmState
 
+_UNITS = {"state_age": "s", "command_age": "s", "tracking_error": "rad", "rest_velocity": "rad/s"}
+
 
 @dataclass(frozen=True)
 class Watchdogs:
-    """What stops the arm if it is exceeded.
+    """What stops the arm, or keeps it from starting, if it is exceeded.
 
     Raises:
         GymMaraError: a limit is no positive number.
@@ -27,11 +29,13 @@ class Watchdogs:
     """The largest age of the command, s."""
     tracking_error: float = 0.2
     """How far a joint may be from its set-point, rad (m)."""
+    rest_velocity: float = 0.02
+    """How fast a joint may be measured where the arm starts or resumes, rad/s (m/s): what is measured at rest is never exactly zero."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            unit = "s" if field.name.endswith("age") else "rad"
+            unit = _UNITS[field.name]
             object.__setattr__(self, field.name, positive_number(field.name, value, unit))
 
 

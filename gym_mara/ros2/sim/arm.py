@@ -10,7 +10,7 @@ import numpy as np
 from gym_mara.backends import Backend
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.arm import Clock
-from gym_mara.ros2.sim.trajectories import Path, Point, Trajectory, row
+from gym_mara.ros2.sim.trajectories import Goal, Path, Point, ServoWay, Trajectory, Way, row
 from gym_mara.state import SimState
 from gym_mara.types import Floats
 
@@ -49,8 +49,8 @@ class SimulatedArm:
         """How many there were."""
         self._random = np.random.default_rng(seed)
         self._lock = threading.Lock()
-        self._pending: tuple[Trajectory | Floats | None, float] | None = None
-        self._path: Path | None = None
+        self._pending: tuple[Trajectory | Goal | Floats | None, float] | None = None
+        self._path: Way | None = None
         self._number = self._started = 0
         self._resetting: threading.Event | None = None
         self._limits = self.robot.lower, self.robot.upper
@@ -90,6 +90,21 @@ class SimulatedArm:
         """
         return self._command(row(positions, self.robot.num_joints, "position"), 0.0)
 
+    def move_servos(self, names: Sequence[str], points: Sequence[Point]) -> int:
+        """Move each joint by itself to its position in the first point, at its velocity there, as the real MARA of 2019 did. The time
+        of the point and other points have no effect; without a point the arm stops where it is. Returns the command's number.
+
+        Args:
+            names: of the joints, in the order of the points' values.
+            points: positions and velocities.
+
+        Raises:
+            GymMaraError: the first point is not complete and finite, has no velocities, or has other joints. Nothing changes.
+        """
+        return self._command(
+            Goal.of(self.robot.joint_names, names, points) if len(points) else None, 0.0
+        )
+
     def reset(self) -> threading.Event:
         """Put the arm at rest at its home pose with the next tick, and forget all commands. The event is set when that is done."""
         with self._lock:
@@ -107,7 +122,7 @@ class SimulatedArm:
                 return RUNNING
             return DONE if self._path is None or self.time >= self._path.end else RUNNING
 
-    def _command(self, command: Trajectory | Floats | None, delay: float) -> int:
+    def _command(self, command: Trajectory | Goal | Floats | None, delay: float) -> int:
         with self._lock:
             self._number += 1
             self._pending = command, delay
@@ -143,11 +158,15 @@ class SimulatedArm:
         self.state = self.backend.state
         """The state after the last tick."""
 
-    def _begin(self, command: Trajectory | Floats | None, delay: float) -> None:
+    def _begin(self, command: Trajectory | Goal | Floats | None, delay: float) -> None:
         """Begin to follow a command, from the reference."""
+        now = self.time
         if isinstance(command, Trajectory):
-            now = self.time
             self._path = Path(now, self._reference, self._velocity, command, now + delay)
+            return
+        if isinstance(command, Goal):
+            near = command._replace(q=np.clip(command.q, *self._limits))
+            self._path = ServoWay(now, self._reference, near)
             return
         self._path = None
         self._reference = self.state.q[0].copy() if command is None else command

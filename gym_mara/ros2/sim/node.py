@@ -79,7 +79,7 @@ class SimNode:
             node.create_subscription(kind, topic, self._obey(command), qos)
             for kind, topic, command, qos in (
                 (JointTrajectory, TRAJECTORY, self._follow, messages.RELIABLE),
-                (JointTrajectory, MARA_2019, self._follow, messages.SENSOR_DATA),
+                (JointTrajectory, MARA_2019, self._move_servos, messages.SENSOR_DATA),
                 (Float64MultiArray, FORWARD, self._move_to, messages.RELIABLE),
             )
         ]
@@ -175,6 +175,9 @@ class SimNode:
         self.arm.follow(
             message.joint_names, messages.points(message), self.delay_of(message.header)
         )
+
+    def _move_servos(self, message: Any) -> None:
+        self.arm.move_servos(message.joint_names, messages.points(message))
 
     def _move_to(self, message: Any) -> None:
         self.arm.move_to(message.data)

@@ -1,9 +1,9 @@
-"""Trajectories of joints: checked points by name, and the path between them over time. Nothing here needs ROS."""
+"""Trajectories of joints: checked points by name, and the ways between them over time. Nothing here needs ROS."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,6 +88,68 @@ def _finite(what: str, values: ArrayLike) -> Floats:
     if not bool((np.abs(array) <= LARGEST).all()):
         raise GymMaraError(f"{what} must be finite, not {array}")
     return array
+
+
+class Goal(NamedTuple):
+    """Where each joint shall be, and how fast it moves there by itself, in the order of a robot's joints, all finite."""
+
+    q: Floats
+    """Joint positions (J,), rad (m)."""
+    speed: Floats
+    """Not negative (J,), rad/s (m/s)."""
+
+    @classmethod
+    def of(cls, joint_names: Sequence[str], names: Sequence[str], points: Sequence[Point]) -> Goal:
+        """The goal of a trajectory, of which the first point counts, without its time.
+
+        Raises:
+            GymMaraError: as in `Trajectory.of`, or the point has no velocities.
+        """
+        first = Trajectory.of(
+            joint_names, names, [point._replace(time=0.0) for point in points[:1]]
+        )
+        if first.qd is None:
+            raise GymMaraError(
+                "a command to the servos of 2019 must have a velocity for each joint, rad/s: how fast it moves to its position"
+            )
+        return cls(first.q[0], np.abs(first.qd[0]))
+
+
+class Way(Protocol):
+    """How a reference moves."""
+
+    end: float
+    """The time at its end, s, where it rests; infinite for never."""
+
+    def at(self, time: float) -> tuple[Floats, Floats]:
+        """The position and the velocity of the reference (J,), rad (m) and rad/s (m/s)."""
+
+
+class ServoWay:
+    """The way of a reference to a goal, each joint by itself at its own speed, as MARA's servos move.
+
+    Args:
+        now: the time, s.
+        q: where the reference is (J,), rad (m).
+        goal: where it shall be.
+    """
+
+    def __init__(self, now: float, q: Floats, goal: Goal) -> None:
+        self._start, self._q, self._goal = now, q, goal
+        self._way = goal.q - q
+        times = np.zeros(len(q))
+        moving = self._way != 0.0
+        with np.errstate(divide="ignore", over="ignore"):  # at no speed it never arrives
+            times[moving] = np.abs(self._way[moving]) / goal.speed[moving]
+        self._times = times
+        self.end = now + float(times.max())
+
+    def at(self, time: float) -> tuple[Floats, Floats]:
+        """As in `Way`."""
+        passed = time - self._start
+        arrived = self._times <= passed
+        velocity = np.where(arrived, 0.0, np.copysign(self._goal.speed, self._way))
+        return np.where(arrived, self._goal.q, self._q + passed * velocity), velocity
 
 
 class Path:

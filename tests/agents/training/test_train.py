@@ -217,6 +217,7 @@ def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
         ({"algo": "pop"}, "unknown algorithm 'pop'. Did you mean 'ppo'"),
         ({"env": "MARA-v9"}, "unknown environment 'MARA-v9'.*MARACollision-v0"),
         ({"backend": "gazebo"}, "unknown backend 'gazebo'.*pinocchio"),
+        ({"backend": "ros2"}, r"dart, mujoco, .*ros2 deploy.*MARAReal-v0.*docs/ros2\.md"),
         ({"steps": 0}, "steps must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every must be at least 1"),
         ({"env_options": {"colour": "red"}}, "unknown keyword argument 'colour'"),

@@ -78,7 +78,24 @@ def test_a_joint_at_its_end_stop_may_be_measured_a_little_beyond(mara: RobotMode
     assert arm.tick(None).q[1] == mara.upper[1]
 
 
-@pytest.mark.parametrize("field", ["state_age", "command_age", "tracking_error"])
+def test_an_arm_with_noisy_encoders_starts_and_resumes_with_a_larger_rest_velocity(
+    mara: RobotModel,
+) -> None:
+    noisy = np.array([0.04, -0.03, 0.0, 0.02, -0.049, 0.01])
+    limits = MotionLimits.of(mara)
+    with pytest.raises(GymMaraError, match=r"at -0\.049 rad/s.*below 0\.02.*rest_velocity"):
+        SafetyFilter(mara, PERIOD, limits).start(state_of(mara.home, 1.0, noisy), 1.0)
+    safety = SafetyFilter(mara, PERIOD, limits, Watchdogs(rest_velocity=0.05))
+    safety.start(state_of(mara.home, 1.0, noisy), 1.0)
+    safety.stop("a test")
+    safety.step(1.01, state_of(mara.home, 1.01, noisy), None, 1.0)
+    assert safety.mode is Mode.STOPPED
+    with pytest.raises(GymMaraError, match=r"0\.098 rad/s.*below 0\.05"):
+        safety.resume(state_of(mara.home, 1.01, 2.0 * noisy), 1.01)
+    safety.resume(state_of(mara.home, 1.01, noisy), 1.01)
+
+
+@pytest.mark.parametrize("field", ["state_age", "command_age", "tracking_error", "rest_velocity"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, None, True])
 def test_a_watchdog_that_never_barks_is_an_error(field: str, value: Any) -> None:
     with pytest.raises(GymMaraError, match=f"{field} must be finite and positive"):

@@ -112,6 +112,25 @@ def test_the_way_from_rest_to_a_constant_target_is_straight(mara: RobotModel) ->
     np.testing.assert_allclose(np.array(path), part[:, None] * target, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("way", "share", "least"), [(1.5, 1.0, 0.99), (0.5, 0.25, 0.99), (1e-3, 1.0, 0)]
+)
+def test_the_time_of_a_way_is_known(
+    mara: RobotModel, way: float, share: float, least: float
+) -> None:
+    motion, limits = _motion(mara), MotionLimits.of(mara)
+    q = np.array(motion.q)
+    target = q + way * np.array([1.0, -0.5, 0.2, 0.0, 0.7, -0.9])
+    ticks = 0
+    while not (ticks and motion.resting):
+        assert motion.propose(target.tolist(), share)
+        motion.accept()
+        ticks += 1
+    known = limits.duration(target - q, share)
+    assert least * known < ticks * PERIOD < known + 2.0 * PERIOD
+    assert limits.duration(0.0 * q) == 0.0
+
+
 def test_a_stop_is_followed_to_its_end_and_no_further(mara: RobotModel) -> None:
     motion = _motion(mara)
     for _ in range(30):

@@ -84,10 +84,31 @@ def test_the_next_command_begins_where_the_reference_is(
     assert np.diff(way, axis=0)[25:] / arm.period == pytest.approx(np.full((24, 6), 0.25), abs=0.01)
 
 
-def test_the_points_of_2019_are_targets_at_once(arm: SimulatedArm, mara: RobotModel) -> None:
-    goal = near_home(mara)
-    arm.follow(mara.joint_names, [Point(goal.tolist(), [0.5] * 6, 0.001)])
-    assert ticks(arm, 0.5)[-1] == pytest.approx(goal, abs=1e-3)
+def test_the_servos_of_2019_move_at_the_velocity_of_the_point(
+    arm: SimulatedArm, mara: RobotModel
+) -> None:
+    way, speed = np.array([0.5, -0.5, 0.25, 0.0, 0.1, 0.5]), np.array([0.5, -0.5, 0.5, 0.0, 0.2, 1])
+    point = Point((mara.home + way)[::-1].tolist(), speed[::-1].tolist(), 0.001)
+    number = arm.move_servos(mara.joint_names[::-1], [point, Point([0.0] * 6, (), 1.0)])
+    moved = ticks(arm, 1.0) - mara.home
+    late = 1.0 / SERVO["servo_gain"]
+    assert moved[24] == pytest.approx(np.sign(way) * np.abs(speed) * (0.5 - late), abs=0.01)
+    assert arm.outcome(number) == DONE
+    assert ticks(arm, 0.5)[-1] == pytest.approx(mara.home + way, abs=1e-3)
+
+
+def test_a_servo_of_2019_without_speed_stays_and_the_next_command_counts(
+    arm: SimulatedArm, mara: RobotModel
+) -> None:
+    goal = near_home(mara).tolist()
+    number = arm.move_servos(mara.joint_names, [Point(goal, [0.5] * 5 + [0.0], 0.001)])
+    assert ticks(arm, 1.0)[-1] == pytest.approx([*goal[:5], mara.home[5]], abs=1e-3)
+    assert arm.outcome(number) == RUNNING
+    moving = arm.move_servos(mara.joint_names, [Point(goal, [0.5] * 6, 0.001)])
+    ticks(arm, 0.2)
+    arm.move_servos((), ())
+    assert arm.outcome(moving) == REPLACED
+    assert ticks(arm, 0.5)[-1, 5] == pytest.approx(mara.home[5] + 0.1, abs=0.03)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300])
@@ -102,6 +123,10 @@ def test_refused_commands_change_nothing(arm: SimulatedArm, mara: RobotModel, ba
         lambda: arm.move_to([0.0] * 7),
         lambda: arm.follow(mara.joint_names, [Point(values, (), 1.0)]),
         lambda: arm.follow(mara.joint_names, [Point(goal.tolist(), values, 1.0)]),
+        lambda: arm.move_servos(mara.joint_names, [Point(goal.tolist(), (), 0.001)]),
+        lambda: arm.move_servos(mara.joint_names, [Point(goal.tolist(), values, 0.001)]),
+        lambda: arm.move_servos(mara.joint_names, [Point(values, [0.5] * 6, 0.001)]),
+        lambda: arm.move_servos(mara.joint_names[:5], [Point(values[:5], [0.5] * 5, 0.001)]),
         lambda: arm.follow(mara.joint_names[:5], [Point(goal[:5].tolist(), (), 1.0)]),
         lambda: arm.follow([*mara.joint_names, "x"], [Point([0.0] * 7, (), 1.0)]),
         lambda: arm.follow(mara.joint_names, [Point(goal.tolist(), (), 1.0)], delay=-2.5),
@@ -118,6 +143,9 @@ def test_targets_are_clipped_to_the_limits(goal: list[float], time: float) -> No
     arm = made()
     mara = arm.robot
     arm.follow(mara.joint_names, [Point(goal, [-v for v in goal], time)])
+    for q in ticks(arm, 0.2):
+        assert np.all((q >= mara.lower) & (q <= mara.upper))
+    arm.move_servos(mara.joint_names, [Point(goal, [-v for v in goal], time)])
     for q in ticks(arm, 0.2):
         assert np.all((q >= mara.lower) & (q <= mara.upper))
 

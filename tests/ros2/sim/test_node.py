@@ -81,6 +81,11 @@ def trajectory(goal: Any, seconds: float = 0.2, names: list[str] = NAMES) -> Any
     return messages.trajectory(names, np.asarray(goal, np.float64), None, seconds)
 
 
+def servos(goal: Any) -> Any:
+    """A command in the form of 2019."""
+    return messages.trajectory(NAMES, np.asarray(goal, np.float64), np.full(6, 0.5), 0.001)
+
+
 def send(publisher: Any, message: Any) -> None:
     """Publish once, when somebody listens."""
     eventually(lambda: publisher.get_subscription_count() > 0)
@@ -103,7 +108,7 @@ def test_it_reports_the_arm(node: SimNode, peer: Peer, mara: RobotModel) -> None
 def test_it_obeys_all_forms_of_commands(node: SimNode, peer: Peer, mara: RobotModel) -> None:
     commands: list[tuple[Any, Callable[[Any], Any]]] = [
         (peer.publisher(JointTrajectory, sim.TRAJECTORY), trajectory),
-        (peer.publisher(JointTrajectory, sim.MARA_2019, messages.SENSOR_DATA), trajectory),
+        (peer.publisher(JointTrajectory, sim.MARA_2019, messages.SENSOR_DATA), servos),
         (
             peer.publisher(Float64MultiArray, sim.FORWARD),
             messages.positions,
@@ -114,6 +119,10 @@ def test_it_obeys_all_forms_of_commands(node: SimNode, peer: Peer, mara: RobotMo
         send(publisher, message(goal))
         eventually(is_at(node, goal))
     assert node.refused == 0
+    began, goal = node.arm.time, node.arm.state.q[0] + 0.3
+    commands[1][0].publish(servos(goal))
+    eventually(is_at(node, goal))
+    assert node.arm.time - began > 0.3 / 0.5, "the velocity of the point is its speed"
 
 
 def test_bad_commands_are_refused_and_logged(
