@@ -7,7 +7,7 @@ READY = $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test test-slow lint bench experiment test-kilted test-oldest test-rllib test-wheel clean
+.PHONY: demo test test-slow lint docs docs-links bench experiment test-kilted test-oldest test-rllib test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
@@ -23,6 +23,14 @@ lint: $(READY) ## Check format, lint and types.
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+SPHINX = .venv-docs/bin/python -m sphinx -q -W --keep-going -c docs/site -d docs/_build/doctrees
+
+docs: .venv-docs/.ready ## Build the site into docs/_build/html. A warning is an error, and so is a link to a page or heading that is not there.
+	$(SPHINX) -b html docs docs/_build/html
+
+docs-links: .venv-docs/.ready ## Look up the site's links to other sites, which needs a network.
+	$(SPHINX) -b linkcheck docs docs/_build/links
 
 bench: ## Measure speed. The other packages that it compares with pin an older MuJoCo, hence a separate virtual environment.
 	$(MAKE) .venv-bench/.ready VENV=.venv-bench EXTRAS=bench
@@ -46,7 +54,7 @@ test-wheel: ## Build the wheel, install it outside the checkout, and use every e
 	.ci/test-wheel $(PYTHON)
 
 clean: ## Remove the virtual environments and the files of the tools.
-	rm -rf .venv .venv-bench .venv-kilted .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf docs/_build .venv .venv-bench .venv-docs .venv-kilted .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
@@ -75,6 +83,12 @@ endef
 	$(@D)/bin/python $(PIP_INSTALL) --no-deps -r constraints-oldest.txt
 	$(OTHERS_FROM_VENV)
 	$(@D)/bin/python -c 'import gymnasium; assert gymnasium.__version__.startswith("1.1."), gymnasium.__version__'
+	touch $@
+
+.venv-docs/.ready: $(READY) $(CONSTRAINTS)
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python $(PIP_INSTALL) -c $(CONSTRAINTS) furo myst-parser sphinx
+	$(OTHERS_FROM_VENV)
 	touch $@
 
 # What ray[rllib] adds to ray, and the Gymnasium that it pins.

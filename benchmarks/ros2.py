@@ -191,13 +191,18 @@ def deployment(env: str, targets: int) -> None:
                 deployed.close()
         ticks = found.setpoints
         late = [1e3 * value for value in (*ticks.lateness, *found.lateness)]
+        angle = f"{_quantiles(angles)} degrees, " if len(angles) else ""
         print(
-            f"deploy: {profile}, {targets} targets of {env} on dart: error p50 {np.median(errors):.4f}, p95 {np.quantile(errors, 0.95):.4f} mm, "
-            f"angle p50 {np.median(angles):.4f}, p95 {np.quantile(angles, 0.95):.4f} degrees, {stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
+            f"deploy: {profile}, {targets} targets of {env} on dart: error {_quantiles(errors)} mm, {angle}"
+            f"{stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
             f"{ticks.missed} of {ticks.ticks} missed; actions at 50 Hz: late by p50 {late[3]:.2f}, p99 {late[4]:.2f} ms, "
             f"{found.missed_ticks} of {found.steps} missed",
             flush=True,
         )
+
+
+def _quantiles(values: Floats) -> str:
+    return f"p50 {np.median(values):.4f}, p95 {np.quantile(values, 0.95):.4f}"
 
 
 def _quiet(line: str) -> None:
@@ -224,7 +229,7 @@ def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floa
         errors.append(1e3 * float(np.linalg.norm(state.ee_position[0] - position)))
         if deployed.oriented:
             angles.append(float(np.degrees(angle_between(state.ee_quaternion[0], quaternion))))
-    return np.array(errors or [np.nan]), np.array(angles or [np.nan]), stops
+    return np.array(errors or [np.nan]), np.array(angles), stops
 
 
 if __name__ == "__main__":

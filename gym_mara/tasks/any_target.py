@@ -60,7 +60,7 @@ class AnyTargetTask(Task):
     """Whether the way to the nearest configuration for the target is observed, which inverse kinematics finds."""
     position_tolerance: float = 0.002
     """The largest distance to the target that is a success, m."""
-    angle_tolerance: float = np.radians(2.5)
+    angle_tolerance: float = float(np.radians(2.5))
     """The largest angle to the target that is a success, rad; used with `orientation`."""
     length_per_angle: float = 0.2
     """How much an angle counts beside a distance, m/rad."""

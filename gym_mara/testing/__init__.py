@@ -1,12 +1,14 @@
-"""For authors of backends: the contract as a suite of tests, which every backend of this package passes too.
+"""For authors of backends: the contract as a suite of tests.
 
-from gym_mara.testing import BackendContract, Make
+Every backend of this package passes it. A test of yours::
 
-class TestMyBackend(BackendContract):
-    @pytest.fixture
-    def make(self) -> Make:
-        robot = RobotModel.load("mara")
-        return lambda num_envs: MyBackend(robot, num_envs)
+    from gym_mara.testing import BackendContract, Make
+
+    class TestMyBackend(BackendContract):
+        @pytest.fixture
+        def make(self) -> Make:
+            robot = RobotModel.load("mara")
+            return lambda num_envs: MyBackend(robot, num_envs)
 """
 
 from gym_mara.testing.contract import BackendContract, Make

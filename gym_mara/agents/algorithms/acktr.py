@@ -55,8 +55,8 @@ class ACKTR(OnPolicyAlgorithm):
         critic_kl: the same for the critic.
         damping, fisher_decay, momentum, cold_updates: of the K-FAC optimisers; see `gym_mara.agents.algorithms.kfac.KFAC`.
         normalize_advantage: whether the advantages of a rollout are scaled to mean 0 and variance 1.
-        rollout_buffer_class, rollout_buffer_kwargs, stats_window_size, tensorboard_log, policy_kwargs, verbose, seed,
-            device: as in all algorithms of Stable-Baselines3.
+        rollout_buffer_class, rollout_buffer_kwargs, stats_window_size, tensorboard_log, policy_kwargs, verbose, seed, device: as
+            in all algorithms of Stable-Baselines3.
 
     Raises:
         GymMaraError: the policy has parameters other than those of linear layers and the log standard deviation.
