@@ -2,17 +2,17 @@
 
 from gym_mara.agents.algorithms.base import Algorithm, LogRange, Preset, Presets, SearchSpace
 
-# As for PPO γ = 0, because the next state depends on the action alone. Rollouts are longer, so that the memory is trained, and
-# the noise is independent for each joint: the policy "natural" has no memory.
+# As for PPO γ = 0, because the next state depends on the action alone, and many short updates. The noise is independent for each
+# joint, because the policy "natural" has no memory.
 _TELEPORTING = Preset(
     num_envs=64,
     policy="lstm",
     arguments={
-        "n_steps": 8,
-        "batch_size": 256,
+        "n_steps": 4,
+        "batch_size": 128,
         "n_epochs": 4,
         "gamma": 0.0,
-        "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
+        "learning_rate": ((0.0, 3e-3), (1.0, 0.0)),
         "clip_range": 0.2,
         "policy_kwargs": {"net_arch": [64], "lstm_hidden_size": 64, "log_std_init": -2.0},
     },
@@ -39,9 +39,9 @@ ALGORITHM = Algorithm(
     presets={"tuned": Presets(_TELEPORTING, _TRAVELLING)},
     search_space=SearchSpace(
         arguments={
-            "n_steps": [4, 8, 16],
+            "n_steps": [2, 4, 8],
             "n_epochs": [2, 4, 8],
-            "learning_rate": LogRange(1e-4, 1e-2),
+            "learning_rate": LogRange(3e-4, 3e-2),
         },
         policy_kwargs={"lstm_hidden_size": [32, 64, 128]},
     ),
