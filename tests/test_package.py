@@ -1,4 +1,4 @@
-"""The wheel: that it has every folder of the package, and the pretrained policies."""
+"""The package: that its wheel has every folder and the pretrained policies, and how it is cited."""
 
 from __future__ import annotations
 
@@ -21,3 +21,17 @@ def test_the_wheel_has_every_pretrained_policy() -> None:
     folder = ROOT / "gym_mara" / "pretrained"
     others = [f.name for f in folder.iterdir() if f.suffix != ".onnx" and f.is_file()]
     assert others == ["__init__.py"]
+
+
+def test_the_citation_names_the_package_as_it_is() -> None:
+    about = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    for field, line in {
+        "name": "title: {}",
+        "description": "abstract: {}",
+        "license": "license: {}",
+    }.items():
+        value = re.findall(f'^{field} = "(.*)"$', about, re.M)[0]
+        assert line.format(value) in citation.splitlines()
+    [author] = re.findall(r'authors = \[\{ name = "(.*)" \}\]', about)
+    assert f"  - name: {author}" in citation.splitlines()
