@@ -9,12 +9,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import scipy.stats
 from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 
 from gym_mara.compat.gym_gazebo2 import GazeboMaraEnv
 from gym_mara.errors import GymMaraError
-from tests.helpers import TARGET_Q, TASK_NAMES, golden, golden_q, robot_model
+from tests.helpers import MODULAR_ARMS, TARGET_Q, TASK_NAMES, golden, golden_q, robot_model
 
 STILL = np.zeros(6, np.float32)
 KEYS = {
@@ -25,7 +26,15 @@ KEYS = {
     "ep_rew_mean",
     "ep_rew_min",
     "num_coll",
+    "ep_dist_std",
+    "ep_dist_skew",
+    "ep_rew_std",
+    "ep_rew_skew",
+    "target_x",
+    "target_y",
+    "target_z",
 }
+RANDOM_TARGET = "MARARandomTarget-v0"
 
 
 def test_the_import_registers_the_original_ids() -> None:
@@ -33,7 +42,7 @@ def test_the_import_registers_the_original_ids() -> None:
         "import gymnasium, gym_mara\n"
         "assert 'MARA-v0' not in gymnasium.registry\n"
         "import gym_mara.compat.gym_gazebo2\n"
-        f"for name in {TASK_NAMES}: gymnasium.make(name).reset(seed=0)\n"
+        f"for name in {[*TASK_NAMES, RANDOM_TARGET]}: gymnasium.make(name).reset(seed=0)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -64,10 +73,77 @@ def test_set_episode_size_sets_the_length_of_episodes(size: int | None) -> None:
             rewards.append(reward)
             steps += 1
             assert ("infos" in info) is ended
-        assert steps == (size or 2048)
+        assert steps == (size or 1024)
         assert info["infos"].keys() == KEYS
         assert info["infos"]["ep_rew_mean"] == pytest.approx(np.mean(rewards))
         assert info["infos"]["num_coll"] == 0
+
+
+def test_the_statistics_of_an_episode_are_those_of_its_steps() -> None:
+    env: Any = gymnasium.make("MARA-v0")
+    env.set_episode_size(50)
+    env.action_space.seed(0)
+    for _ in range(2):  # the second episode does not count the steps of the first
+        env.reset(seed=0)
+        distances, rewards = [], []
+        for _ in range(50):
+            _, reward, *_, info = env.step(env.action_space.sample())
+            distances.append(info["distance"])
+            rewards.append(reward)
+        infos = info["infos"]
+        for name, values in {"dist": distances, "rew": rewards}.items():
+            assert infos[f"ep_{name}_std"] == pytest.approx(np.std(values), rel=1e-12)
+            assert infos[f"ep_{name}_skew"] == pytest.approx(scipy.stats.skew(values), rel=1e-9)
+        assert [infos[f"target_{axis}"] for axis in "xyz"] == [-0.40028, 0.095615, 0.72466]
+
+
+def test_the_skewness_of_equal_values_is_zero() -> None:
+    env: Any = gymnasium.make("MARA-v0")
+    env.set_episode_size(3)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step(STILL)
+    assert [info["infos"][f"ep_dist_{name}"] for name in ("std", "skew")] == [0.0, 0.0]
+
+
+def test_a_restored_episode_ends_with_the_same_statistics() -> None:
+    env: Any = gymnasium.make(RANDOM_TARGET)
+    env.set_episode_size(6)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 6)).astype(np.float32)
+    for action in actions[:3]:
+        env.step(action)
+    snapshot = env.save_state()
+    ends = []
+    for _ in range(2):
+        for action in actions[3:]:
+            *_, info = env.step(action)
+        ends.append(info["infos"])
+        env.restore_state(snapshot)
+    assert ends[0] == ends[1]
+
+
+def test_random_target_draws_one_of_two_targets_that_the_observation_does_not_contain() -> None:
+    env: Any = gymnasium.make(RANDOM_TARGET)
+    env.reset(seed=0)
+    kinematics, drawn = env.simulation.robot.kinematics(), []
+    for _ in range(40):
+        observation, _ = env.reset()
+        target = env.simulation.goal.position[0]
+        tool = kinematics.pose(observation[None, :6])[0][0]
+        np.testing.assert_allclose(observation[6:9], tool - target, atol=1e-12)
+        assert observation.shape == (12,)
+        # From the arm's base, which stands at z = 0.68 m and is turned by 90°.
+        drawn.append((target[1], -target[0], target[2] - 0.68))
+    found = {tuple(np.round(each, 9).tolist()) for each in drawn}
+    assert found == {(-0.5, 0.2, 0.25), (-0.5, -0.2, 0.25)}
+
+
+def test_the_targets_of_random_target_can_be_reached_but_not_by_any_arm() -> None:
+    with pytest.warns(UserWarning, match=r"\[-0.2, -0.5, 0.93\] is out of reach of"):
+        GazeboMaraEnv(RANDOM_TARGET, robot=MODULAR_ARMS[3])
+    with pytest.raises(GymMaraError, match="leave out target_position"):
+        GazeboMaraEnv(RANDOM_TARGET, target_position=[0.0, 0.5, 0.9])
 
 
 def test_original_observation_replaces_the_velocity_with_the_jacobian_times_the_position() -> None:

@@ -1,9 +1,11 @@
-"""The wheel: that it has every folder of the package, and the pretrained policies."""
+"""The package: that its wheel has every folder and the pretrained policies, and how it is cited."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+
+from gym_mara.robot.catalog import own_robots
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -12,7 +14,8 @@ def test_the_wheel_has_every_folder_with_modules() -> None:
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     listed = re.findall(r'"([\w.]+)"', text.split("packages = [")[1].split("]")[0])
     folders = {file.parent.relative_to(ROOT) for file in (ROOT / "gym_mara").rglob("*.py")}
-    assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + ["gym_mara.robots"])
+    robots = ["gym_mara.robots", *(f"gym_mara.robots.{name}" for name in own_robots())]
+    assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + robots)
 
 
 def test_the_wheel_has_every_pretrained_policy() -> None:
@@ -21,3 +24,17 @@ def test_the_wheel_has_every_pretrained_policy() -> None:
     folder = ROOT / "gym_mara" / "pretrained"
     others = [f.name for f in folder.iterdir() if f.suffix != ".onnx" and f.is_file()]
     assert others == ["__init__.py"]
+
+
+def test_the_citation_names_the_package_as_it_is() -> None:
+    about = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    for field, line in {
+        "name": "title: {}",
+        "description": "abstract: {}",
+        "license": "license: {}",
+    }.items():
+        value = re.findall(f'^{field} = "(.*)"$', about, re.M)[0]
+        assert line.format(value) in citation.splitlines()
+    [author] = re.findall(r'authors = \[\{ name = "(.*)" \}\]', about)
+    assert f"  - name: {author}" in citation.splitlines()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
+from gym_mara.agents.training import DEFAULT_LOGGERS, LOGGERS
 from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.agents import print_metrics
 from gym_mara.cli.common import (
@@ -25,9 +26,12 @@ from gym_mara.cli.common import (
     interruptible,
     is_given,
     keyword_arguments,
+    names_in,
     needs_agents,
+    one_of,
     out,
     refuse,
+    several,
     whole,
 )
 from gym_mara.cli.policies import PolicyOption
@@ -74,6 +78,15 @@ def train(
         ),
     ] = None,
     from_policy: PolicyOption = "last",
+    log: Annotated[
+        list[str],
+        typer.Option(
+            parser=several(one_of("logger", lambda: LOGGERS)),
+            envvar="MARA_LOG_FORMAT",
+            metavar="NAMES",
+            help=f"Loggers, separated by commas: {', '.join(LOGGERS)}. The table progress.csv is always written.",
+        ),
+    ] = [*DEFAULT_LOGGERS],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
     """Train an agent into a run folder: policy, checkpoints, learning curve, TensorBoard log. Needs the extra train."""
     with needs_agents():
@@ -83,14 +96,16 @@ def train(
         from gym_mara.agents.training.train import train as start_training
         from gym_mara.agents.training.warm_start import started_from
 
+    loggers = names_in("--log", log)
     if resume is not None:
-        others = (p.name or "" for p in context.command.params if p.name != "resume")
+        params = context.command.params
+        others = (p.name or "" for p in params if p.name not in ("resume", "log"))
         refuse(context, "--resume uses the options of the run", *others)
         interrupted = RunFolder.open(resume)
         if not interrupted.checkpoints() and interrupted.config.start is None:
             out.print("The run has no checkpoint: it starts from the beginning.", soft_wrap=True)
         with _progress(interrupted.config.steps, resume) as on_progress:
-            run = resume_training(resume, on_progress)
+            run = resume_training(resume, on_progress, log=loggers)
     else:
         options = keyword_arguments(settings)
         chosen = {"env": env, "algo": algo, "backend": backend, "preset_name": preset}
@@ -104,7 +119,7 @@ def train(
             config = started_from(source, from_policy, options, **given, **numbers)
         folder = out_folder or _default_folder(config)
         with _progress(config.steps, folder) as on_progress:
-            run = start_training(config, folder, on_progress)
+            run = start_training(config, folder, on_progress, log=loggers)
     metrics = evaluate_run(run, episodes=episodes_to_judge(run.config))
     print_metrics(f"{run.config.env} on {run.config.backend}, last policy", metrics)
     if (trained := run.trained_steps()) > run.config.steps:

@@ -12,31 +12,38 @@ import numpy as np
 from gymnasium.envs.registration import register
 from numpy.typing import NDArray
 
+from gym_mara.compat.moments import Moments
+from gym_mara.compat.two_targets import TwoTargetsTask
 from gym_mara.envs import MaraEnv
 from gym_mara.errors import GymMaraError, flag, positive_number, whole_number
 from gym_mara.robot import RobotModel
 from gym_mara.robot.kinematics import Kinematics
 from gym_mara.state import SimState
-from gym_mara.tasks import MAX_EPISODE_STEPS, PAPER_TASKS, Goal, Observation, Part
+from gym_mara.tasks import PAPER_TASKS, Goal, Observation, Part, Task
 from gym_mara.types import Floats
 
 RUN_VELOCITY = 0.5
 """The default joint speed of gym-gazebo2's run mode, rad/s."""
+EPISODE_SIZE = 1024
+"""The default length of gym-gazebo2's episodes, steps."""
 # Flags of gym-gazebo2 that only concern Gazebo and ROS, and the reason why gym_mara does not need them.
 _NO_MEANING = {
     "multi_instance": "environments are independent, so make as many as you like",
     "port": "there is no simulator to connect to",
 }
+# The tasks that are not those of the same name in gym_mara.
+_TASKS: dict[str, Task] = {"MARARandomTarget-v0": TwoTargetsTask()}
 
 
 class GazeboMaraEnv(MaraEnv):
     """MaraEnv with the interface of gym-gazebo2.
 
-    The environment itself truncates an episode, after 2048 steps or after the number of steps from `set_episode_size`.
-    The last `info` of an episode contains gym-gazebo2's statistics under `infos`.
+    The environment itself truncates an episode, after 1024 steps or after the number of steps from `set_episode_size`.
+    The last `info` of an episode contains gym-gazebo2's statistics under `infos`: largest, mean and smallest value, standard
+    deviation and skewness of the distance (m) and of the reward, the number of collisions, and the position of the target (m).
 
     Args:
-        task: the name of a task.
+        task: the name of a task; "MARARandomTarget-v0" is gym-gazebo2's, with two targets.
         gui: show the arm in the browser; flag -g of gym-gazebo2's scripts.
         real_speed: joints move with a limited speed, and do not jump to their targets; flag -r.
         velocity: the joint speed with real_speed, rad/s; flag -v.
@@ -72,8 +79,9 @@ class GazeboMaraEnv(MaraEnv):
             options["max_joint_velocity"] = positive_number("velocity", speed, "rad/s")
         if gui:
             options["render_mode"] = "human"
-        super().__init__(task, **options)
-        self._episode_size = MAX_EPISODE_STEPS
+        super().__init__(_TASKS.get(task, task) if isinstance(task, str) else task, **options)
+        self._episode_size = EPISODE_SIZE
+        self._moments = Moments()
         if original_observation:
             replacement = _position_for_velocity(self.simulation.robot)
             parts = self.simulation.observation.parts
@@ -87,6 +95,14 @@ class GazeboMaraEnv(MaraEnv):
         """Set the length of the current and all later episodes, steps."""
         self._episode_size = whole_number("episode_size", episode_size)
 
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode, as in MaraEnv."""
+        result = super().reset(seed=seed, options=options)
+        self._moments = Moments()
+        return result
+
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Execute an action (A,) for one control period.
 
@@ -95,14 +111,27 @@ class GazeboMaraEnv(MaraEnv):
         """
         observation, reward, terminated, truncated, info = super().step(action)
         statistics = info["statistics"]
+        self._moments.add(info["distance"], reward)
         truncated = truncated or statistics["ep_steps"] >= self._episode_size
         if terminated or truncated:
-            info["infos"] = {name: v for name, v in statistics.items() if name != "ep_steps"}
+            info["infos"] = self._infos(statistics)
         return observation, reward, terminated, truncated, info
 
+    def _infos(self, statistics: dict[str, float]) -> dict[str, float]:
+        """gym-gazebo2's statistics of the episode that ends."""
+        target = dict(zip("xyz", self.simulation.goal.position[0].tolist(), strict=True))
+        return {
+            **{name: value for name, value in statistics.items() if name != "ep_steps"},
+            **self._moments.summary(),
+            **{f"target_{axis}": value for axis, value in target.items()},
+        }
+
     def save_state(self) -> dict[str, Any]:
-        """A snapshot as in MaraEnv, with the length of the episodes."""
-        return super().save_state() | {"episode_size": self._episode_size}
+        """A snapshot as in MaraEnv, with the length of the episodes and their statistics."""
+        return super().save_state() | {
+            "episode_size": self._episode_size,
+            "moments": self._moments.values.copy(),
+        }
 
     def restore_state(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot of an environment with the same arguments.
@@ -112,9 +141,10 @@ class GazeboMaraEnv(MaraEnv):
         """
         super().restore_state(snapshot)
         self._episode_size = snapshot["episode_size"]
+        self._moments.values[...] = snapshot["moments"]
 
     def _snapshot_form(self) -> dict[str, Any]:
-        return super()._snapshot_form() | {"episode_size": int}
+        return super()._snapshot_form() | {"episode_size": int, "moments": self._moments.values}
 
 
 def _position_for_velocity(robot: RobotModel) -> Part:
@@ -132,7 +162,7 @@ def _jacobian_times_position(kinematics: Kinematics, state: SimState, goal: Goal
 
 
 _ENVIRONMENTS: dict[str, dict[str, str]] = {
-    **{name: {"task": name} for name in PAPER_TASKS},
+    **{name: {"task": name} for name in (*PAPER_TASKS, *_TASKS)},
     "MARAReal-v0": {"task": "MARA-v0", "backend": "ros2", "profile": "mara-2019"},
 }
 for _name, _keywords in _ENVIRONMENTS.items():

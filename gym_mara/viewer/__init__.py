@@ -8,6 +8,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from gym_mara.envs import make_vector_env
+from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.registration import environment
 
@@ -18,7 +19,7 @@ def watch(
     env: str,
     backend: str,
     keywords: dict[str, Any],
-    policy: Callable[[Any], ArrayLike | None] | None = None,
+    begin: Callable[[Simulation], Callable[[Any], ArrayLike]] | None = None,
     *,
     speed: float = 1.0,
     seed: int | None = None,
@@ -30,8 +31,9 @@ def watch(
         env: the name of an environment.
         backend: the name of a backend.
         keywords: keyword arguments of the environment.
-        policy: maps observations of one arm, with a leading axis of length 1, to actions (1, A). None: the user moves the
-            joints with the sliders, from the home configuration, in one episode without an end.
+        begin: is called once with the simulation, and returns a policy: it maps observations of one arm, with a leading axis of
+            length 1, to actions (1, A). None: the user moves the joints with the sliders, from the home configuration, in one
+            episode without an end.
         speed: the speed of the simulation relative to real time.
         seed: the seed of the environment.
         endless: whether the policy's episode goes on until something terminates it; else one episode of the environment's length
@@ -50,8 +52,8 @@ def watch(
         simulation.streams = (Streams.seeded(seed),)
         viewer = Viewer(simulation, simulation.options.rendering)
         viewer.set_speed(speed)
-        if policy is not None:
-            viewer.run(policy, None if endless else environment(env).max_episode_steps)
+        if begin is not None:
+            viewer.run(begin(simulation), None if endless else environment(env).max_episode_steps)
         else:
             viewer.jog()
             viewer.run(lambda _: None, None)

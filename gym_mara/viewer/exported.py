@@ -56,7 +56,7 @@ def watch_exported(
         name,
         keywords.pop("backend"),
         keywords,
-        lambda observation: policy.predict(observation)[0],
+        lambda _: lambda observation: policy.predict(observation)[0],
         speed=speed,
         endless=follows,
     )

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 POLICY_FORMS = {
     "mlp": "gym_mara.agents.algorithms.unit_policy:MlpPolicy",
+    "lstm": "gym_mara.agents.algorithms.lstm_policy:LstmPolicy",
     "natural": "gym_mara.agents.algorithms.natural_gaussian:NaturalGaussianPolicy",
     "sac": "gym_mara.agents.algorithms.squashed_policy:SquashedPolicy",
     "tqc": "gym_mara.agents.algorithms.squashed_policy:SquashedQuantilePolicy",
@@ -104,7 +105,7 @@ _NETWORK = (6, 1024)
 ACTIVATIONS = ("ReLU", "Tanh", "ELU", "SiLU", "GELU", "LeakyReLU")
 """The activation functions of a network, each a class in `torch.nn`."""
 _POLICY_NUMBERS = ("log_std_init", "ortho_init", "covariance_rate", "bias_rate", "widening")
-_POLICY_COUNTS = {"n_critics": 8, "n_quantiles": 128}
+_POLICY_COUNTS = {"n_critics": 8, "n_quantiles": 128, "lstm_hidden_size": 1024, "n_lstm_layers": 4}
 """The whole numbers among the arguments of a network, each with its largest value."""
 
 

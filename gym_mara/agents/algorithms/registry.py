@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gym_mara.agents.algorithms.base import Algorithm
-from gym_mara.agents.algorithms.entries import acktr, ppo, sac, tqc, trpo
+from gym_mara.agents.algorithms.entries import acktr, ppo, ppo_lstm, sac, tqc, trpo
 from gym_mara.errors import unknown
 
 ALGORITHMS: dict[str, Algorithm] = {
@@ -14,6 +14,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         acktr.ALGORITHM,
         sac.ALGORITHM,
         tqc.ALGORITHM,
+        ppo_lstm.ALGORITHM,
     )
 }
 DEFAULT_ALGORITHM = "ppo"

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 from torch import nn
@@ -59,6 +60,10 @@ def to_onnx(network: BasePolicy, about: PolicyDescription) -> onnx.ModelProto:
 
 def _layers(network: BasePolicy, groups: dict[str, int]) -> tuple[list[str], list[nn.Module]]:
     """The order in which a network concatenates its inputs, and its layers up to the most probable action."""
+    if isinstance(network, RecurrentActorCriticPolicy):
+        raise GymMaraError(
+            "cannot export a recurrent policy: an exported policy has no memory. Train with an algorithm without one, such as ppo"
+        )
     if isinstance(network, NaturalGaussianPolicy):
         actor: Any = network
         layers = [*network.mlp_extractor.policy_net, network.action_layer()]

@@ -214,8 +214,8 @@ def watch_run(
     """
     settings = _settings(run, backend, options, which, log)
     with Player(run, backend, settings, which=which) as player:
-        act, settings = player.act, player.options
-    watch(run.config.env, backend, settings, act, speed=speed, seed=run.config.seed)
+        begin, settings = player.begin, player.options
+    watch(run.config.env, backend, settings, begin, speed=speed, seed=run.config.seed)
 
 
 def _settings(

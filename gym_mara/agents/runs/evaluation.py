@@ -98,10 +98,11 @@ class Player:
         except BaseException:
             self.env.close()
             raise
+        self._act = self.policy.begin(self.env.simulation)
 
     def act(self, observation: Floats) -> Floats:
-        """The actions (N, A) for observations (N, O)."""
-        return self.policy.predict(observation)[0]
+        """The actions (N, A) for the next observations (N, O) of the arms."""
+        return self._act(observation)
 
     def step(self) -> Outcome:
         """Let the policy act for one step; the outcome holds the state that the task judged."""
@@ -112,7 +113,7 @@ class Player:
 
     def begin(self, simulation: Simulation) -> Act:
         """What acts in the episodes of an evaluation."""
-        return self.act
+        return self.policy.begin(simulation)
 
     @property
     def velocity_limit(self) -> float | None:

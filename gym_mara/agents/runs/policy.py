@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import ArrayLike, NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
@@ -41,11 +42,14 @@ class Policy:
 
     It has the `predict` of Stable-Baselines3's policies, so that `evaluate_policy` takes it. Scaling of actions and
     normalisation of observations are inside. `about.action.keywords` makes an environment whose actions mean the same.
+    A recurrent policy has a memory: play it with `begin`, or give `predict` the state that it returned, as
+    `evaluate_policy` does.
     """
 
     def __init__(self, network: BasePolicy, about: PolicyDescription) -> None:
         self.about = about
         self._network = network
+        self._recurrent = isinstance(network, RecurrentActorCriticPolicy)
         low, high = np.array(about.low), np.array(about.high)
         self._scaling = Scaling(low, high, unit_box(len(low)))
         normalisation = about.normalisation
@@ -65,19 +69,21 @@ class Policy:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Floats, None]:
-        """The action (A,) for an observation (O,) of the environment, or the actions (N, A) for a batch (N, O).
+    ) -> tuple[Floats, Any]:
+        """The action (A,) for an observation (O,) of the environment, or the actions (N, A) for a batch (N, O); and the state.
 
         Those of a policy that was trained with absolute actions are joint targets, rad; others are UnitActions, which an
         environment of joint targets refuses.
 
         Args:
             observation: as the environment returns it, not normalised.
-            state, episode_start: not used; the policy has no memory.
+            state: of a recurrent policy, as this method returned it with the last action; None at the beginning. Other policies
+                ignore it, and return None.
+            episode_start: of a recurrent policy, the arms (N,) whose episodes begin, and whose memory is cleared.
             deterministic: whether to take the most probable action, and not a random one.
 
         Raises:
-            GymMaraError: the observation has another shape or is not finite.
+            GymMaraError: the observation, or the state of a recurrent policy, has another shape or is not finite.
         """
         groups = self.about.groups
         observed: Any
@@ -92,15 +98,60 @@ class Policy:
         if self._normalised:
             scaled = (observed - self._mean) / self._deviation
             observed = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
+        memory: dict[str, Any] = {}
+        if self._recurrent:
+            rows = next(iter(observed.values())) if isinstance(observed, dict) else observed
+            memory = self._memory(state, episode_start, len(np.atleast_2d(rows)))
         try:
-            actions, _ = self._network.predict(observed, deterministic=deterministic)
+            actions, state = self._network.predict(observed, **memory, deterministic=deterministic)
         except RuntimeError as error:  # a matrix of the policy has no inverse
             raise DamagedRunError(f"the policy cannot compute an action: {error}") from error
         if not np.isfinite(actions).all():
             raise DamagedRunError("the policy's action is not finite: its weights are damaged")
         scaled = self._scaling.targets(actions)
         absolute = self.about.action.mode == "absolute"
-        return (scaled if absolute else scaled.view(UnitActions)), None
+        return (
+            scaled if absolute else scaled.view(UnitActions),
+            state if self._recurrent else None,
+        )
+
+    def begin(self, simulation: Simulation) -> Callable[[Any], Floats]:
+        """What acts in the episodes of a simulation: the actions (N, A) for observations (N, O), deterministic.
+
+        A recurrent policy remembers the steps of an episode, and forgets them when the next one begins.
+        """
+        state: Any = None
+
+        def act(observation: Any) -> Floats:
+            nonlocal state
+            actions, state = self.predict(observation, state, simulation.statistics.steps == 0)
+            return actions
+
+        return act
+
+    def _memory(self, state: Any, episode_start: Any, count: int) -> dict[str, Any]:
+        """The state and the episode starts of N arms, as keyword arguments of the network.
+
+        Raises:
+            GymMaraError: they have another shape, or are not finite.
+        """
+        network: Any = self._network
+        layers, _, size = network.lstm_hidden_state_shape
+        shape = (layers, count, size)
+        if state is not None and not (
+            isinstance(state, tuple)
+            and len(state) == 2
+            and all(np.shape(each) == shape and np.isfinite(each).all() for each in state)
+        ):
+            raise GymMaraError(
+                f"the state must be what predict returned for as many arms, two finite arrays {shape}; or None"
+            )
+        starts = (
+            np.zeros(count, np.bool_) if episode_start is None else np.atleast_1d(episode_start)
+        )
+        if starts.shape != (count,):
+            raise GymMaraError(f"episode_start must have the shape ({count},), not {starts.shape}")
+        return {"state": state, "episode_start": starts}
 
     def _checked(self, observation: Any, size: int) -> Floats:
         try:

@@ -120,11 +120,10 @@ class CheckpointCallback(BaseCallback):
     def _evaluate(self) -> dict[str, float]:
         """The mean of each metric that an episode has, of the policy as it is saved."""
         assert self._eval_env is not None
-        policy = policy_of(self.model)
         config = self.run.config
         metrics = play_episodes(
             self._eval_env,
-            lambda _: lambda observation: policy.predict(observation)[0],
+            policy_of(self.model).begin,
             steps=environment(config.env).max_episode_steps,
             episodes=self._eval_env.num_envs,
             seed=MOST_SEED + 1 + config.seed,  # the same episodes in every evaluation

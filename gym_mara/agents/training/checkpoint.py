@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium.spaces import Dict, Space
+from numpy.typing import NDArray
+from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -75,6 +78,8 @@ def state_files(model: BaseAlgorithm, progress: Progress) -> dict[str, list[Buff
         "env": base_env(model).save_state(),
         "random": _random_state(),
     }
+    if isinstance(model, RecurrentPPO):
+        state["memory"] = _memory(model)
     files: dict[str, list[Buffer]] = {}
     if isinstance(model, OffPolicyAlgorithm):
         files[REPLAY_FILE] = replay_contents(buffer_of(model))
@@ -152,6 +157,8 @@ def _check(model: BaseAlgorithm, state: Any) -> None:
         "env": {"env": dict, "returns": wrapped.returns},
         "random": list,
     }
+    if isinstance(model, RecurrentPPO):
+        form["memory"] = _memory(model)
     if isinstance(model, OffPolicyAlgorithm):
         form["off_policy"] = {
             "variables": dict.fromkeys(variables_of(model), torch.Tensor),
@@ -182,6 +189,9 @@ def _restore(model: BaseAlgorithm, state: dict[str, Any]) -> Progress:
         running: RunningMeanStd = getattr(wrapped, name)
         vars(running).update(values)
     wrapped.returns = state["returns"]
+    if isinstance(model, RecurrentPPO):
+        pairs = [tuple(map(torch.from_numpy, each)) for each in state["memory"]]
+        model._last_lstm_states = RNNStates(*pairs)
     base_env(model).restore_state(state["env"])
     _restore_random_state(state["random"])
     return Progress(*map(float, state["progress"]))
@@ -194,6 +204,12 @@ def _restore_off_policy(model: OffPolicyAlgorithm, state: dict[str, Any], checkp
         variable.copy_(state["variables"][name])
     model.action_space._np_random = state["warm_up"]  # random actions before the first update
     read_replay(checkpoint / REPLAY_FILE, buffer_of(model), state["replay"])
+
+
+def _memory(model: RecurrentPPO) -> list[list[NDArray[np.float32]]]:
+    """The states of the LSTMs of a recurrent model: of actor and critic, each the hidden and the cell state."""
+    states: Any = model._last_lstm_states
+    return [[each.numpy() for each in pair] for pair in states]
 
 
 def _plain(value: Any) -> Any:

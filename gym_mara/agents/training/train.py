@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
-import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
@@ -15,15 +13,9 @@ import numpy as np
 import torch
 from gymnasium.spaces import Dict
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import (
-    CSVOutputFormat,
-    KVWriter,
-    Logger,
-    TensorBoardOutputFormat,
-)
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-from torch.utils.tensorboard import SummaryWriter
 
 from gym_mara.agents.algorithms.base import Preset, is_schedule, policy_class
 from gym_mara.agents.algorithms.off_policy import WarmUp
@@ -34,10 +26,12 @@ from gym_mara.agents.algorithms.registry import (
 )
 from gym_mara.agents.runs.config import check_backend
 from gym_mara.agents.runs.evaluation import make_env
-from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder, read_progress
+from gym_mara.agents.runs.folder import DamagedRunError, RunConfig, RunFolder
 from gym_mara.agents.runs.policy import base_env, policy_arguments
+from gym_mara.agents.training import DEFAULT_LOGGERS
 from gym_mara.agents.training.callbacks import CheckpointCallback, OnProgress
 from gym_mara.agents.training.checkpoint import Progress, restore_state
+from gym_mara.agents.training.loggers import check_loggers, make_writers
 from gym_mara.agents.training.replay import hindsight
 from gym_mara.agents.training.warm_start import begin_with
 from gym_mara.backends import DEFAULT_BACKEND
@@ -46,7 +40,12 @@ from gym_mara.files import DamagedFileError, locked, refuse_links
 
 
 def train(
-    config: RunConfig, out: Path, on_progress: OnProgress, *, preset: Preset | None = None
+    config: RunConfig,
+    out: Path,
+    on_progress: OnProgress,
+    *,
+    preset: Preset | None = None,
+    log: Sequence[str] = DEFAULT_LOGGERS,
 ) -> RunFolder:
     """Train an agent into a new run folder.
 
@@ -55,11 +54,14 @@ def train(
         out: the folder.
         on_progress: called after every rollout.
         preset: hyperparameters to use instead of the preset that the configuration names.
+        log: the loggers, from `gym_mara.agents.training.LOGGERS`; the table of the run is always written.
 
     Raises:
         GymMaraError: a name is unknown, a value is out of range, or the folder exists.
+        MissingExtraError: the library of a logger is not installed.
         TrainingDivergedError: the agent's parameters are no longer finite.
     """
+    check_loggers(log)
     algorithm(config.algo)  # an unknown name is an error before anything is built
     check_backend(config.backend)
     config = replace(config, preset=asdict(preset or preset_of(config)))
@@ -72,7 +74,7 @@ def train(
             raise
     run = RunFolder.create(out, config)
     with _locked(run):
-        return _learn(run, model, on_progress)
+        return _learn(run, model, on_progress, log)
 
 
 def preset_of(config: RunConfig) -> Preset:
@@ -92,24 +94,32 @@ def preset_of(config: RunConfig) -> Preset:
         env.close()
 
 
-def resume(path: Path, on_progress: OnProgress) -> RunFolder:
+def resume(
+    path: Path, on_progress: OnProgress, *, log: Sequence[str] = DEFAULT_LOGGERS
+) -> RunFolder:
     """Resume a run from its last checkpoint. The result is the same as without the interruption.
 
+    Args:
+        path: the run folder.
+        on_progress, log: as in `train`.
+
     Raises:
+        MissingExtraError: the library of a logger is not installed.
         GymMaraError: the folder holds no run, the run is damaged or has finished, another process trains it, or a symbolic
             link is in it.
         TrainingDivergedError: the agent's parameters are no longer finite.
     """
+    check_loggers(log)
     run = RunFolder.open(path)
     try:
         refuse_links(path)
     except DamagedFileError as error:
         raise DamagedRunError(str(error)) from None
     with _locked(run):
-        return _resume(run, on_progress)
+        return _resume(run, on_progress, log)
 
 
-def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
+def _resume(run: RunFolder, on_progress: OnProgress, log: Sequence[str]) -> RunFolder:
     config, checkpoints = run.config, run.checkpoints()
     if checkpoints and run.trained_steps() >= config.steps and run.has_policy("last"):
         raise GymMaraError(
@@ -130,7 +140,7 @@ def _resume(run: RunFolder, on_progress: OnProgress) -> RunFolder:
     except BaseException:
         base_env(model).close()
         raise
-    return _learn(run, model, on_progress, reached)
+    return _learn(run, model, on_progress, log, reached)
 
 
 def _locked(run: RunFolder) -> AbstractContextManager[None]:
@@ -263,11 +273,12 @@ def _learn(
     run: RunFolder,
     model: BaseAlgorithm,
     on_progress: OnProgress,
+    log: Sequence[str],
     reached: Progress = _NOTHING,
 ) -> RunFolder:
     callback = CheckpointCallback(run, reached, on_progress)
     try:
-        model.set_logger(Logger(str(run.path), _writers(run, model.num_timesteps)))
+        model.set_logger(Logger(str(run.path), make_writers(run, model.num_timesteps, log)))
         try:
             on_progress(model.num_timesteps, {})
             left = run.config.steps - model.num_timesteps
@@ -303,30 +314,3 @@ def _is_finite(model: BaseAlgorithm) -> bool:
     if isinstance(log_std := getattr(model.policy, "log_std", None), torch.Tensor):
         numbers += [log_std.exp(), (-log_std).exp()]
     return all(bool(each.isfinite().all()) for each in numbers)
-
-
-def _writers(run: RunFolder, steps: int) -> list[KVWriter]:
-    """The table and the TensorBoard log; a resumed run drops what it wrote there after its last checkpoint."""
-    kept = run.path / "progress.csv.kept"  # the old table, until its rows are in the new one
-    if os.path.lexists(run.progress_file) and not run.progress_file.is_file():
-        raise GymMaraError(f"cannot write {str(run.progress_file)!r}: it is not a plain file")
-    if run.progress_file.is_file() and not kept.is_file():
-        os.replace(run.progress_file, kept)
-    rows = read_progress(kept) if kept.is_file() else []
-    table = CSVOutputFormat(str(run.progress_file))
-    try:
-        for row in rows:
-            if row["time/total_timesteps"] <= steps:
-                table.write(dict(row), {})
-    except BaseException:
-        table.close()
-        raise
-    kept.unlink(missing_ok=True)
-    folder = str(run.path / "tensorboard")
-    if steps == 0:
-        shutil.rmtree(folder, ignore_errors=True)
-    tensorboard = TensorBoardOutputFormat(folder)
-    if steps and tensorboard.writer is not None:
-        tensorboard.writer.close()  # type: ignore[no-untyped-call]
-        tensorboard.writer = SummaryWriter(folder, purge_step=steps + 1)  # type: ignore[no-untyped-call]
-    return [table, tensorboard]
