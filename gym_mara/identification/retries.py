@@ -1,0 +1,112 @@
+"""Other effort limits and frictions, where least squares end in a local minimum."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gym_mara.identification.search import Search
+from gym_mara.identification.start import FRICTIONS
+from gym_mara.types import Floats
+
+_NEAR = np.array([0.4, 0.6, 0.75, 0.87, 0.95, 1.05, 1.15, 1.3])
+"""Parts of the present friction that are tried."""
+_NETS = np.geomspace(0.15, 1.4, 6)
+"""What is left of the effort limit without friction, in parts of the robot's, that is tried where none was reached."""
+_NET_FRICTION = 0.15
+"""The friction that is tried with these, in parts of the effort limit."""
+SEEN = 10.0
+"""A change shows in the log if it changes the sum of squares, in units of their variance, by more than this."""
+
+
+def retry(search: Search, *, near: bool = False, unreached: bool = False) -> bool:
+    """Give each joint a better effort limit and friction, if there are; returns whether there were.
+
+    A motor that speeds up shows only the difference of the two, so least squares may end far away on the line on which it
+    is the same. A joint that seemed not to reach its limit, while the others were far off, may reach it after all.
+
+    Args:
+        search: where it is, and what is changed.
+        near: whether frictions near the present one are tried, and not all.
+        unreached: whether joints that seemed not to reach their limits are tried as well.
+    """
+    space = search.space
+    tried, owners = [search.vector], [-1]
+    pairs = [pair for pair in _pairs(search) if unreached or pair[0] in search.searched]
+    for number, (effort, friction) in enumerate(pairs):
+        for values in _others(search, effort, friction, near):
+            vector = search.vector.copy()
+            vector[effort], vector[friction] = values
+            tried.append(space.inside(vector))
+            owners.append(number)
+    if not pairs:
+        return False
+    costs = _costs(search.errors(np.array(tried)))
+    better = False
+    for number, pair in enumerate(pairs):
+        own = np.flatnonzero(np.array(owners) == number)
+        best = own[costs[own].argmin()] if len(own) else 0
+        if costs[best] < costs[0] - SEEN:
+            better = True
+            search.vector[list(pair)] = tried[best][list(pair)]
+            _search_again(search, pair)
+    return better
+
+
+def _pairs(search: Search) -> list[tuple[int, int]]:
+    """The entries of effort limit and friction of each joint that has both."""
+    space = search.space
+    frictions = {space.entries[index][1]: index for index in space.of("joint_friction")}
+    return [
+        (index, frictions[space.entries[index][1]])
+        for index in space.of("effort_limit")
+        if space.entries[index][1] in frictions
+    ]
+
+
+def _others(search: Search, effort: int, friction: int, near: bool) -> list[tuple[float, float]]:
+    """Effort limits (scales) and frictions, Nm (N), that may be better."""
+    limit = search.space.effort_limit(effort)
+    net = search.vector[effort] * limit - search.vector[friction]
+    if effort in search.left_out:
+        parts = [(part * limit, _NET_FRICTION) for part in _NETS.tolist()]
+    elif net <= 0.0:
+        return []
+    else:
+        now = search.vector[friction] / (net + search.vector[friction])
+        parts = [(net, part) for part in (now * _NEAR if near else FRICTIONS).tolist()]
+    return [(net / (1.0 - part) / limit, part * net / (1.0 - part)) for net, part in parts]
+
+
+def _costs(errors: Floats) -> Floats:
+    """Twice the negative logarithm of the likelihood (M,) of errors of each joint whose deviation is not known (M, T, J)."""
+    squares = (errors**2).mean(axis=1) + 1e-12
+    return np.asarray(errors.shape[1] * np.log(squares).sum(axis=1))
+
+
+def _search_again(search: Search, entries: tuple[int, ...]) -> None:
+    search.left_out = [index for index in search.left_out if index not in entries]
+    search.searched = sorted({*search.searched, *entries})
+
+
+def leave_out_unreached(search: Search) -> None:
+    """Leave out the effort limits that were not reached: higher ones explain the log as well.
+
+    The friction of such a joint does not show either, and is left out with it.
+    """
+    space = search.space
+    own = [index for index in space.of("effort_limit") if index in search.searched]
+    if not own:
+        return
+    search.measure()
+    tried = np.tile(search.vector, (1 + len(own), 1))
+    for row, index in enumerate(own, 1):
+        tried[row, index] = min(max(1.0, 2.0 * search.vector[index]), space.high[index])
+    squares = ((search.errors(tried) / search.deviation) ** 2).sum(axis=(1, 2))
+    for row, index in enumerate(own, 1):
+        if squares[row] - squares[0] < SEEN:
+            search.vector[index] = tried[row, index]
+            joint = space.entries[index][1]
+            friction = [i for i in space.of("joint_friction") if space.entries[i][1] == joint]
+            for each in (index, *friction):
+                search.searched.remove(each)
+                search.left_out.append(each)
