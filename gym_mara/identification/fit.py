@@ -60,7 +60,7 @@ def identify(
         for number in range(_RETRIES):
             better = retry(search, near=True, unreached=number == 0)
             leave_out_unreached(search)
-            search.descend(math.inf, 15)  # each joint now counts by its own noise
+            search.descend(math.inf, 10)  # each joint now counts by its own noise
             if not better:
                 break
         search.measure()

@@ -16,21 +16,26 @@ from tests.identification.arms import hidden, log_of
 ELBOW = 2
 
 
-def test_a_limit_that_seemed_not_to_be_reached_is_found(mara: RobotModel) -> None:
-    true = hidden(mara, 0, [ELBOW])
+@pytest.mark.parametrize("friction", [True, False])
+def test_a_limit_that_seemed_not_to_be_reached_is_found(friction: bool, mara: RobotModel) -> None:
+    names = DEFAULT if friction else DEFAULT[:3]
+    true = hidden(mara, 0, [ELBOW], names)
     log = log_of(mara, "mujoco", true, 2.5, [ELBOW])
-    space = Space(mara, DEFAULT, log.moving)
+    space = Space(mara, names, log.moving)
     followers = Followers(log, mara, "mujoco", space, {})
-    nominal = [float(true["latency"]), float(true["servo_gain"][ELBOW]), 2.0, 0.0]
-    search = Search(space, followers, space.inside(np.array(nominal)))
+    values = [float(true["latency"]), float(true["servo_gain"][ELBOW]), 2.0, 0.0]
+    search = Search(space, followers, space.inside(np.array(values[: len(names)])))
     leave_out_unreached(search)  # its upper end is all that there is to compare with
-    assert search.left_out == [2, 3]
+    assert search.left_out == [2, 3][: len(names) - 2]
     assert not retry(search)
     assert retry(search, unreached=True)
     assert search.left_out == []
-    assert search.searched == [0, 1, 2, 3]
-    net = search.vector[2] * mara.effort_limit[ELBOW] - search.vector[3]
-    wanted = true["effort_limit"][ELBOW] * mara.effort_limit[ELBOW] - true["joint_friction"][ELBOW]
+    assert search.searched == [0, 1, 2, 3][: len(names)]
+    limit = mara.effort_limit[ELBOW]
+    net = search.vector[2] * limit - search.vector[3:].sum()
+    wanted = true["effort_limit"][ELBOW] * limit
+    if friction:
+        wanted -= true["joint_friction"][ELBOW]
     assert net == pytest.approx(wanted, rel=0.4)
     followers.close()
 
