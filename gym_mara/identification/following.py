@@ -1,8 +1,9 @@
-"""Follows a log with many arms at once, each with its own parameters."""
+"""Follows a log with many arms at once, each with its own parameters, on all cores."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -10,13 +11,18 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.backends import backend_settings, make_backend
+from gym_mara.backends.processes import Workers, cores
 from gym_mara.backends.registry import backend_class
 from gym_mara.backends.servo import ServoBackend
+from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
 from gym_mara.identification.log import Log
 from gym_mara.identification.parameters import Space
 from gym_mara.robot import RobotModel
 from gym_mara.types import Floats
+
+_MOST_WORKERS = 16
+"""More processes would have only one arm each, or none."""
 
 
 class Follower:
@@ -74,7 +80,10 @@ class Follower:
             segment: after this time, s, the arms start again from the measured state. Its noise, above all that of the
                 velocity, is then an error of the arms; but they never are far from the log, whatever their parameters.
         """
-        arms, log, starts = self.arms(len(vectors)), self._log, self.starts(segment)
+        log, starts = self._log, self.starts(segment)
+        if not len(vectors):
+            return np.empty((0, len(log.times) - 1, log.q.shape[1]))
+        arms = self.arms(len(vectors))
         arms.set_parameters(self._space.values(vectors))
         path = np.empty((len(log.times) - 1, len(vectors), log.q.shape[1]))
         for tick, target in enumerate(log.targets[:-1]):
@@ -95,6 +104,46 @@ class Follower:
         """Free the engines."""
         for arms in self._arms.values():
             arms.close()
+
+
+class Followers:
+    """Followers of the same log in processes, one for each core, which share the arms.
+
+    Args:
+        log, robot, backend, space, settings: as in `Follower`.
+
+    Raises:
+        GymMaraError, MissingExtraError: as in `Follower`.
+    """
+
+    def __init__(
+        self, log: Log, robot: RobotModel, backend: str, space: Space, settings: dict[str, Any]
+    ) -> None:
+        make = functools.partial(Follower, log, robot, backend, space, settings)
+        own = make()  # checks the settings before a process is started
+        arms = own.arms(1)
+        self.servo_gain, self.joint_velocity = arms.servo_gain or 1.0, arms.joint_velocity
+        """The servo gain, 1/s, and the limits of velocity (J,), rad/s (m/s), of the backend."""
+        self.physics_step = arms.physics_step
+        """Of the backend, s."""
+        self.starts = own.starts
+        self._own = own
+        self._count = choose_workers(min(len(cores()), _MOST_WORKERS), None)
+        self._workers = Workers(make, self._count) if self._count > 1 else None
+
+    def errors(self, vectors: Floats, segment: float = math.inf) -> Floats:
+        """As of a `Follower`, whatever the number of processes."""
+        if self._workers is None or len(vectors) == 1:
+            return self._own.errors(vectors, segment)
+        parts = [part for part in np.array_split(vectors, self._count) if len(part)]
+        parts += [vectors[:0]] * (self._count - len(parts))
+        return np.concatenate(self._workers.call("errors", [(part, segment) for part in parts]))
+
+    def close(self) -> None:
+        """End the processes, and free the engines."""
+        if self._workers is not None:
+            self._workers.close()
+        self._own.close()
 
 
 def without_shapes(robot: RobotModel) -> RobotModel:

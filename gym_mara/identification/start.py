@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gym_mara.backends.servo_motion import late_servo_motion
-from gym_mara.identification.following import Follower
+from gym_mara.identification.following import Followers
 from gym_mara.identification.log import Log
 from gym_mara.identification.parameters import Space
 from gym_mara.types import Floats
@@ -19,29 +19,28 @@ _ALIKE = 1.02
 """Parameters whose squared error is this close to the smallest one explain the log as well."""
 
 
-def start(log: Log, space: Space, follower: Follower) -> Floats:
+def start(log: Log, space: Space, followers: Followers) -> Floats:
     """A parameter vector (P,) from which least squares can begin.
 
     The latency and the gains are those with which ideal servos, without inertia, follow the log best. Then the backend
     follows with effort limits and joint frictions from low to high, and each joint takes its best.
     """
     vector = space.nominal.copy()
-    _servos(log, space, follower, vector)
+    _servos(log, space, followers, vector)
     if space.of("effort_limit"):
-        _efforts(space, follower, vector)
+        _efforts(space, followers, vector)
     return space.inside(vector)
 
 
-def _servos(log: Log, space: Space, follower: Follower, vector: Floats) -> None:
+def _servos(log: Log, space: Space, followers: Followers, vector: Floats) -> None:
     latency, gains = space.of("latency"), space.of("servo_gain")
     late, scale = np.zeros(1), np.ones(1)
     if latency:
         late = np.linspace(0.0, space.high[latency[0]], _LATENCIES)
     if gains:
         scale = np.geomspace(space.low[gains[0]], space.high[gains[0]], _GAINS)
-    arms = follower.arms(1)
-    gain = (arms.servo_gain or 1.0) * scale
-    errors = _ideal_errors(log, late, gain, arms.joint_velocity, follower.starts(SEGMENT))
+    gain = followers.servo_gain * scale
+    errors = _ideal_errors(log, late, gain, followers.joint_velocity, followers.starts(SEGMENT))
     best = errors.min(axis=1)
     # Each joint counts alike, however far it moves.
     chosen = int((best / best.min(axis=0)).sum(axis=1).argmin())
@@ -74,18 +73,18 @@ def _ideal_errors(
     return errors
 
 
-def _efforts(space: Space, follower: Follower, vector: Floats) -> None:
+def _efforts(space: Space, followers: Followers, vector: Floats) -> None:
     """Give each joint the best of a grid of effort limits and frictions; all joints take the same at the same time."""
     efforts, frictions = space.of("effort_limit"), space.of("joint_friction")
     scales = np.geomspace(space.low[efforts[0]], space.high[efforts[0]], _EFFORTS)
-    parts = FRICTIONS if frictions else FRICTIONS[:1]
+    parts = FRICTIONS[::2] if frictions else FRICTIONS[:1]
     scale, part = (grid.ravel() for grid in np.meshgrid(scales, parts, indexing="ij"))
     tried = np.tile(vector, (len(scale), 1))
     tried[:, efforts] = scale[:, None]
     for index in frictions:
         tried[:, index] = part * scale * space.effort_limit(index)
     tried = space.inside(tried)
-    errors = (follower.errors(tried, SEGMENT) ** 2).mean(axis=1)
+    errors = (followers.errors(tried, SEGMENT) ** 2).mean(axis=1)
     for index in (*efforts, *frictions):
         column = errors[:, space.entries[index][1]]
         best = int(column.argmin())

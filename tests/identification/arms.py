@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from gym_mara.backends import make_backend
+from gym_mara.backends.randomisation import PARAMETERS
 from gym_mara.backends.servo import ServoBackend
 from gym_mara.identification import Log, excitation
+from gym_mara.identification.parameters import DEFAULT
 from gym_mara.robot import RobotModel
 from gym_mara.types import Floats
 
@@ -18,8 +20,13 @@ NOISE = 0.0002
 WORKERS: dict[str, dict[str, Any]] = {"dart": {"workers": 1}, "mujoco": {"threads": 1}}
 
 
-def hidden(robot: RobotModel, seed: int, joints: Sequence[int] | None = None) -> dict[str, Floats]:
-    """Parameters of an arm that is strong enough to hold itself; all of its joints, or those, differ from the robot's."""
+def hidden(
+    robot: RobotModel,
+    seed: int,
+    joints: Sequence[int] | None = None,
+    names: Sequence[str] = DEFAULT,
+) -> dict[str, Floats]:
+    """Parameters of an arm that is strong enough to hold itself; these of all its joints, or of some, differ from the robot's."""
     generator = np.random.default_rng(seed)
     count = robot.num_joints
     friction = generator.uniform(0.03, 0.1, count) * robot.effort_limit
@@ -28,11 +35,13 @@ def hidden(robot: RobotModel, seed: int, joints: Sequence[int] | None = None) ->
         "servo_gain": generator.uniform(0.6, 1.8, count),
         "effort_limit": generator.uniform(0.4, 0.8, count),
         "joint_friction": friction,
+        "mass": generator.uniform(0.6, 1.6, count),
     }
+    parameters = {name: parameters[name] for name in names}
     for joint in range(count):
         if joints is not None and joint not in joints:
-            for name, own in (("servo_gain", 1.0), ("effort_limit", 1.0), ("joint_friction", 0.0)):
-                parameters[name][joint] = own
+            for name in parameters.keys() - {"latency"}:
+                parameters[name][joint] = PARAMETERS[name].nominal
     return parameters
 
 
@@ -52,7 +61,8 @@ def log_of(
     ranges = {
         name: (0.0 if name in ("latency", "joint_friction") else 1e-3, 200.0) for name in parameters
     }
-    ranges["latency"] = 0.0, 0.2
+    if "latency" in ranges:
+        ranges["latency"] = 0.0, 0.2
     options = {"randomisation": ranges, **WORKERS[backend]}
     arm = make_backend(backend, robot, 1, options)
     assert isinstance(arm, ServoBackend)
