@@ -194,7 +194,7 @@ def deployment(env: str, targets: int) -> None:
         angle = f"{_quantiles(angles)} degrees, " if len(angles) else ""
         print(
             f"deploy: {profile}, {targets} targets of {env} on dart: error {_quantiles(errors)} mm, {angle}"
-            f"{stops} stops; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
+            f"{len(stops)} stops{stops or ''}; set-points at {RATE:.0f} Hz: late by p50 {late[0]:.2f}, p99 {late[1]:.2f}, at most {late[2]:.2f} ms, "
             f"{ticks.missed} of {ticks.ticks} missed; actions at 50 Hz: late by p50 {late[3]:.2f}, p99 {late[4]:.2f} ms, "
             f"{found.missed_ticks} of {found.steps} missed",
             flush=True,
@@ -209,20 +209,22 @@ def _quiet(line: str) -> None:
     """What a deployment says of itself is not printed."""
 
 
-def _errors(deployed: Deployment, robot: RobotModel, targets: int) -> tuple[Floats, Floats, int]:
-    """The distance to each target at its end, mm, the angle, degrees, and how often the filter stopped the arm."""
+def _errors(
+    deployed: Deployment, robot: RobotModel, targets: int
+) -> tuple[Floats, Floats, list[str]]:
+    """The distance to each target at its end, mm, the angle, degrees, and why the filter stopped the arm, each time."""
     from gym_mara.ros2.deploy import Target
 
     rng, poses = np.random.default_rng(0), FreePoses(robot)
-    errors, angles, stops = [], [], 0
+    errors, angles, stops = [], [], []
     for _ in range(targets):
         here = np.clip(deployed.backend.state.q[0], robot.lower, robot.upper)
         _, position, quaternion = poses.draw_move(rng, here)
         orientation = tuple(quaternion.tolist()) if deployed.oriented else None
         deployed.aim(Target(tuple(position.tolist()), orientation)).result()
         deployed.run(HOLD)
-        if deployed.diagnostics.status.startswith("stopped"):
-            stops += 1
+        if (status := deployed.diagnostics.status).startswith("stopped"):
+            stops.append(status)
             deployed.resume()
             continue
         state = deployed.backend.state
