@@ -18,7 +18,7 @@ from gym_mara.envs.streams import Streams
 from gym_mara.envs.workspace import RobotWorkspace
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.diagnostics import Diagnostics
-from gym_mara.ros2.driver import ArmStoppedError
+from gym_mara.ros2.driver import ArmStoppedError, spare_what_is_loaded
 from gym_mara.ros2.safety import Mode
 from gym_mara.types import Floats
 
@@ -105,6 +105,7 @@ class Deployment:
                 goal = simulation.goal
                 quaternion = tuple(goal.quaternion[0]) if self.oriented else None
                 self.check(Target(tuple(goal.position[0]), quaternion))
+            spare_what_is_loaded()  # with all that has been loaded since the driver's start
         except BaseException:
             self.close()
             raise

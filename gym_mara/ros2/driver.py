@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections import deque
 from typing import NamedTuple
@@ -19,6 +20,15 @@ _REPEATED = 0.2
 """For how long the last set-point of a stop is sent again, s, because messages can be lost."""
 _MARGIN = 1.0
 """How much longer than a stop `close` and `resume_if_blocked` wait for its end, s."""
+
+
+def spare_what_is_loaded() -> None:
+    """Leave all objects that there are now out of garbage collections, until `gc.unfreeze`.
+
+    A full collection of some loaded libraries takes 0.1 s, and an arm without set-points for so long has to stop.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 class ArmStoppedError(GymMaraError):
@@ -83,6 +93,7 @@ class Driver:
             self.safety.start(self._reported(), self._clock.now())
             self._hold()
         if thread and self._thread is None:
+            spare_what_is_loaded()
             self._thread = threading.Thread(target=self._run, name="gym_mara driver", daemon=True)
             self._thread.start()
 
@@ -216,4 +227,5 @@ class Driver:
             self._ending = True  # the thread ends when the arm has stopped
             thread.join(self.safety.longest_stop + _MARGIN)
             self._thread = None
+            gc.unfreeze()
         self.link.close()

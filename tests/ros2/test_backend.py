@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -238,7 +239,9 @@ def test_closing_a_moving_arm_brings_it_to_rest(robot: RobotModel) -> None:
     backend.reset(backend.state.q)
     _steps(backend, 20)
     assert np.abs(backend.arm.qd).max() > 0.1
+    assert gc.get_freeze_count() > 10_000, "a garbage collection would take long"
     backend.close()
+    assert gc.get_freeze_count() == 0
     assert not backend.arm.qd.any()
     assert backend.arm.closed
     backend.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2 import graph, messages
 from gym_mara.ros2.arm import Clock, WallClock
+from gym_mara.ros2.driver import spare_what_is_loaded
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.sim.arm import Pace, SimulatedArm
 from gym_mara.state import Contact, SimState
@@ -124,6 +126,7 @@ class SimNode:
             seconds: for how long, s of simulated time; None for no end.
         """
         end = None if seconds is None else self.arm.time + seconds
+        spare_what_is_loaded()
         while end is None or self.arm.time < end:
             self.pace.wait()
             self.tick()
@@ -156,6 +159,7 @@ class SimNode:
         """End the node and the backend."""
         self.ros.close()
         self.arm.backend.close()
+        gc.unfreeze()
 
     # The methods from here on run in the thread of the node.
 
