@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from gym_mara.robot.catalog import own_robots
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -12,7 +14,8 @@ def test_the_wheel_has_every_folder_with_modules() -> None:
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     listed = re.findall(r'"([\w.]+)"', text.split("packages = [")[1].split("]")[0])
     folders = {file.parent.relative_to(ROOT) for file in (ROOT / "gym_mara").rglob("*.py")}
-    assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + ["gym_mara.robots"])
+    robots = ["gym_mara.robots", *(f"gym_mara.robots.{name}" for name in own_robots())]
+    assert sorted(listed) == sorted([".".join(f.parts) for f in folders] + robots)
 
 
 def test_the_wheel_has_every_pretrained_policy() -> None:
