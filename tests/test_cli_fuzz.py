@@ -123,7 +123,9 @@ VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
-    "policy": ["last", "best", "pretrained", "policy.onnx"],
+    "policy": ["last", "best", "pretrained", "policy.onnx", "run", "ik"],
+    "form": ["minari"],
+    "pixels": ["32", "64"],
     "start": ["run"],
     "from_policy": ["last", "best"],
     "preset": preset_names(),
@@ -143,7 +145,7 @@ VALID: dict[str, Sequence[str]] = {
     "run": ["run"],
     "resume": ["run"],
     "folder": ["grid"],
-    "out_folder": ["new", "new/deep"],
+    "out_folder": ["new", "new/deep", "new-v0"],
     "out_file": ["new.html"],
     "video": ["new.gif", "new.mp4"],
     "file": ["mara", "ur5"],
@@ -155,11 +157,12 @@ VALID: dict[str, Sequence[str]] = {
     "settings": SETTINGS,
 }
 FORCED = {
+    "record": ["policy", "out_folder", "episodes"],
     "train": ["steps"],
     "benchmark": ["env", "algo", "steps", "seeds", "out_folder"],
     "search": ["env", "algo", "steps", "trials", "seeds", "jobs", "out_folder"],
 }
-"""Options without which a call would train for long."""
+"""Options without which a call would take long, or do nothing."""
 RARE = ("report", "search", "benchmark")
 """Commands that take seconds even with the smallest numbers."""
 COMMANDS: dict[str, Any] = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]

@@ -1,0 +1,114 @@
+"""gym-mara record: episodes as a data set."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gym_mara.backends import DEFAULT_BACKEND
+from gym_mara.cli.agents import SeedOption
+from gym_mara.cli.common import (
+    EnvOption,
+    RunBackendOption,
+    SetOption,
+    interruptible,
+    is_given,
+    keyword_arguments,
+    needs_agents,
+    one_of,
+    out,
+    refuse,
+    whole,
+)
+from gym_mara.cli.policies import ONNX, PRETRAINED
+from gym_mara.datasets.contents import LOWEST_PIXELS, MOST_PIXELS, checked_pixels
+from gym_mara.datasets.formats import FORMATS, writer_class
+from gym_mara.errors import GymMaraError
+from gym_mara.pretrained import pretrained_file
+
+IK = "ik"
+
+
+def record(
+    context: typer.Context,
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="RUN",
+            help=f"What acts: a run folder, a file of gym-mara export, {PRETRAINED} (the policy of gym_mara for --env), "
+            f"or {IK} (inverse kinematics and a straight joint move).",
+        ),
+    ],
+    out_folder: Annotated[Path, typer.Option("--out", help="New folder for the data set.")],
+    env: EnvOption = "MARA-v0",
+    backend: RunBackendOption = None,
+    episodes: Annotated[
+        int,
+        typer.Option(parser=whole(1, 100_000), metavar="N", help="How many episodes to record."),
+    ] = 10,
+    seed: SeedOption = 0,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            parser=one_of("format", lambda: FORMATS),
+            metavar="NAME",
+            help=f"Format: {' or '.join(FORMATS)}.",
+        ),
+    ] = FORMATS[0],
+    pixels: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(LOWEST_PIXELS, MOST_PIXELS),
+            metavar="N",
+            help="Also a picture of this width and height, an even number, at each step.",
+        ),
+    ] = None,
+    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+) -> None:
+    """Record episodes as a data set for imitation learning: actions, observations, rewards, success, pictures.
+
+    Needs the extra of the format, and train; with pictures also render, and for an exported policy deploy.
+    """
+    if os.path.lexists(out_folder):
+        raise GymMaraError(f"{str(out_folder)!r} exists and is not overwritten: delete it first")
+    options = keyword_arguments(settings, pictures=pixels is not None)
+    if pixels is not None and (given := {"width", "height"} & options.keys()):
+        raise GymMaraError(f"--pixels is the size of the pictures: leave out --set {min(given)}")
+    if pixels is not None:
+        checked_pixels(pixels)
+    writer_class(form)
+    with needs_agents():
+        from gym_mara.datasets.recording import record as run
+
+    with interruptible("Interrupted; no data set was written."):
+        source = _source(context, policy, env, backend, options)
+        made = run(source, form, out_folder, episodes=episodes, seed=seed, pixels=pixels)
+    share = ""
+    if made.successes is not None:
+        share = f", {100.0 * made.successes / made.episodes:.3g} % end in success"
+    text = f"{out_folder}: {made.episodes:,} episodes of {source.env}, {made.steps:,} steps{share}"
+    out.print(text, soft_wrap=True)
+
+
+def _source(
+    context: typer.Context, policy: str, env: str, backend: str | None, options: dict[str, Any]
+) -> Any:
+    """What acts, as a `gym_mara.datasets.sources.Source`."""
+    from gym_mara.datasets import sources
+
+    if policy == IK:
+        return sources.baseline(IK, env, backend or DEFAULT_BACKEND, options)
+    if policy == PRETRAINED or policy.endswith(ONNX):
+        file = pretrained_file(env) if policy == PRETRAINED else Path(policy)
+        name = env if is_given(context, "env") or policy == PRETRAINED else None
+        return sources.exported(file, name, backend, options)
+    if not os.path.isdir(policy):
+        raise GymMaraError(
+            f"--policy {policy!r} is no run folder, and neither {IK}, {PRETRAINED} nor a file that ends in {ONNX}"
+        )
+    refuse(context, "the run has its own environment", "env")
+    return sources.of_run(Path(policy), backend, options)
