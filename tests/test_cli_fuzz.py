@@ -124,7 +124,7 @@ VALID: dict[str, Sequence[str]] = {
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
     "policy": ["last", "best", "pretrained", "policy.onnx", "run", "ik"],
-    "form": ["minari"],
+    "format": ["minari", "lerobot"],
     "pixels": ["32", "64"],
     "start": ["run"],
     "from_policy": ["last", "best"],

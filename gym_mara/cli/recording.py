@@ -50,10 +50,9 @@ def record(
         typer.Option(parser=whole(1, 100_000), metavar="N", help="How many episodes to record."),
     ] = 10,
     seed: SeedOption = 0,
-    form: Annotated[
+    format: Annotated[  # noqa: A002 - the name of the option
         str,
         typer.Option(
-            "--format",
             parser=one_of("format", lambda: FORMATS),
             metavar="NAME",
             help=f"Format: {' or '.join(FORMATS)}.",
@@ -71,7 +70,7 @@ def record(
 ) -> None:
     """Record episodes as a data set for imitation learning: actions, observations, rewards, success, pictures.
 
-    Needs the extra of the format, and train; with pictures also render, and for an exported policy deploy.
+    Needs the extra of the format, minari or lerobot, and train; with pictures also render, and for an exported policy deploy.
     """
     if os.path.lexists(out_folder):
         raise GymMaraError(f"{str(out_folder)!r} exists and is not overwritten: delete it first")
@@ -80,13 +79,13 @@ def record(
         raise GymMaraError(f"--pixels is the size of the pictures: leave out --set {min(given)}")
     if pixels is not None:
         checked_pixels(pixels)
-    writer_class(form)
+    writer_class(format)
     with needs_agents():
         from gym_mara.datasets.recording import record as run
 
     with interruptible("Interrupted; no data set was written."):
         source = _source(context, policy, env, backend, options)
-        made = run(source, form, out_folder, episodes=episodes, seed=seed, pixels=pixels)
+        made = run(source, format, out_folder, episodes=episodes, seed=seed, pixels=pixels)
     share = ""
     if made.successes is not None:
         share = f", {100.0 * made.successes / made.episodes:.3g} % end in success"

@@ -9,7 +9,7 @@ from gym_mara.datasets.contents import Contents
 from gym_mara.datasets.episode import Episode
 from gym_mara.errors import one_of
 
-FORMATS = ("minari",)
+FORMATS = ("minari", "lerobot")
 
 
 class Writer(ABC):
@@ -46,7 +46,10 @@ def writer_class(name: str) -> type[Writer]:
         GymMaraError: there is no such format.
         MissingExtraError: its libraries are not installed.
     """
-    one_of("format", name, FORMATS)
-    from gym_mara.datasets.minari import MinariWriter
+    if one_of("format", name, FORMATS) == "minari":
+        from gym_mara.datasets.minari import MinariWriter
 
-    return MinariWriter
+        return MinariWriter
+    from gym_mara.datasets.lerobot import LeRobotWriter
+
+    return LeRobotWriter

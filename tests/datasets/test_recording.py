@@ -205,7 +205,7 @@ def test_a_folder_that_appears_meanwhile_is_kept(
     [
         (
             "--policy ik --out new-v0 --format rosbag",
-            "unknown format 'rosbag'. Valid: minari",
+            "unknown format 'rosbag'. Valid: lerobot, minari",
         ),
         ("--policy ik --out there", "exists and is not overwritten"),
         ("--policy ik --out none/new-v0", "make it first"),
