@@ -123,7 +123,7 @@ VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp"],
-    "policy": ["last", "best", "pretrained", "policy.onnx", "run", "ik"],
+    "policy": ["last", "best", "pretrained", "policy.onnx", "run", "ik", "hand"],
     "format": ["minari", "lerobot"],
     "pixels": ["32", "64"],
     "start": ["run"],

@@ -29,7 +29,7 @@ from gym_mara.datasets.formats import FORMATS, writer_class
 from gym_mara.errors import GymMaraError
 from gym_mara.pretrained import pretrained_file
 
-IK = "ik"
+IK, HAND = "ik", "hand"
 
 
 def record(
@@ -39,7 +39,7 @@ def record(
         typer.Option(
             metavar="RUN",
             help=f"What acts: a run folder, a file of gym-mara export, {PRETRAINED} (the policy of gym_mara for --env), "
-            f"or {IK} (inverse kinematics and a straight joint move).",
+            f"{IK} (inverse kinematics and a straight joint move), or {HAND} (you lead the arm in the viewer, until Ctrl-C).",
         ),
     ],
     out_folder: Annotated[Path, typer.Option("--out", help="New folder for the data set.")],
@@ -70,26 +70,40 @@ def record(
 ) -> None:
     """Record episodes as a data set for imitation learning: actions, observations, rewards, success, pictures.
 
-    Needs the extra of the format, minari or lerobot, and train; with pictures also render, and for an exported policy deploy.
+    Needs the extra of the format, minari or lerobot, and train; by hand render in place of train; with pictures also render; and
+    for an exported policy also deploy.
     """
     if os.path.lexists(out_folder):
         raise GymMaraError(f"{str(out_folder)!r} exists and is not overwritten: delete it first")
-    options = keyword_arguments(settings, pictures=pixels is not None)
+    by_hand = policy == HAND
+    options = keyword_arguments(settings, pictures=pixels is not None, viewer=by_hand)
     if pixels is not None and (given := {"width", "height"} & options.keys()):
         raise GymMaraError(f"--pixels is the size of the pictures: leave out --set {min(given)}")
     if pixels is not None:
         checked_pixels(pixels)
     writer_class(format)
-    with needs_agents():
-        from gym_mara.datasets.recording import record as run
-
+    common: dict[str, Any] = {"episodes": episodes, "seed": seed, "pixels": pixels}
     with interruptible("Interrupted; no data set was written."):
-        source = _source(context, policy, env, backend, options)
-        made = run(source, format, out_folder, episodes=episodes, seed=seed, pixels=pixels)
+        if by_hand:
+            from gym_mara.datasets.hand import record_by_hand
+
+            name, chosen = env, backend or DEFAULT_BACKEND
+            made = record_by_hand(name, chosen, options, format, out_folder, **common, log=_print)
+        else:
+            with needs_agents():
+                from gym_mara.datasets.playing import record as run
+
+            source = _source(context, policy, env, backend, options)
+            name = source.env
+            made = run(source, format, out_folder, **common)
     share = ""
     if made.successes is not None:
         share = f", {100.0 * made.successes / made.episodes:.3g} % end in success"
-    text = f"{out_folder}: {made.episodes:,} episodes of {source.env}, {made.steps:,} steps{share}"
+    text = f"{out_folder}: {made.episodes:,} episodes of {name}, {made.steps:,} steps{share}"
+    _print(text)
+
+
+def _print(text: str) -> None:
     out.print(text, soft_wrap=True)
 
 
@@ -107,7 +121,7 @@ def _source(
         return sources.exported(file, name, backend, options)
     if not os.path.isdir(policy):
         raise GymMaraError(
-            f"--policy {policy!r} is no run folder, and neither {IK}, {PRETRAINED} nor a file that ends in {ONNX}"
+            f"--policy {policy!r} is no run folder, and neither {IK}, {HAND}, {PRETRAINED} nor a file that ends in {ONNX}"
         )
     refuse(context, "the run has its own environment", "env")
     return sources.of_run(Path(policy), backend, options)

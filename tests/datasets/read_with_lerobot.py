@@ -13,7 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import dataset_to_policy_features
 
 folder = Path(sys.argv[1])
-data = LeRobotDataset("gym_mara/own", root=folder)
+# torchcodec, the default, needs an FFmpeg of the system.
+data = LeRobotDataset("gym_mara/own", root=folder, video_backend="pyav")
 info = json.loads((folder / "meta" / "info.json").read_text())
 assert (data.num_episodes, data.num_frames, data.fps) == (
     info["total_episodes"],
@@ -38,7 +39,10 @@ assert data.meta.stats["action"]["mean"].shape == features["action"].shape
 batch = next(iter(torch.utils.data.DataLoader(data, batch_size=4)))
 assert batch["action"].shape == (4, *features["action"].shape)
 chunked = LeRobotDataset(
-    "gym_mara/own", root=folder, delta_timestamps={"action": [0.0, 1.0 / data.fps]}
+    "gym_mara/own",
+    root=folder,
+    delta_timestamps={"action": [0.0, 1.0 / data.fps]},
+    video_backend="pyav",
 )
 assert chunked[0]["action"].shape == (2, *features["action"].shape)
 print(f"LeRobot reads {data.num_episodes} episodes, {data.num_frames} frames")

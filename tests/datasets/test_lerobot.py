@@ -13,9 +13,9 @@ import pandas
 import pyarrow.parquet
 import pytest
 
-from gym_mara.datasets import lerobot, lerobot_files, recording
+from gym_mara.datasets import lerobot, lerobot_files
 from gym_mara.datasets.episode import Episode
-from gym_mara.datasets.recording import record
+from gym_mara.datasets.playing import record
 from gym_mara.datasets.sources import baseline
 from gym_mara.datasets.statistics import QUANTILES, merged, of_values
 from gym_mara.errors import GymMaraError
@@ -222,5 +222,5 @@ def test_what_is_not_complete_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("imageio_ffmpeg.count_frames_and_secs", too_few)
     source = baseline("ik", "MARA-v0", "pinocchio", OPTIONS)
     with pytest.raises(GymMaraError, match="is the disk full"):
-        recording.record(source, "lerobot", tmp_path / "new", episodes=1, pixels=32)
+        record(source, "lerobot", tmp_path / "new", episodes=1, pixels=32)
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import train
-from gym_mara.datasets.recording import record
+from gym_mara.datasets.playing import record
 from gym_mara.datasets.sources import baseline
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS

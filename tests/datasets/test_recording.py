@@ -14,10 +14,11 @@ import pytest
 from gym_mara.agents.evaluation.baselines import evaluate_baseline
 from gym_mara.agents.evaluation.episodes import episode_seeds
 from gym_mara.agents.evaluation.rollout import Act
-from gym_mara.datasets import formats, recording, sources
+from gym_mara.datasets import formats, playing, recorder, sources
 from gym_mara.datasets.contents import Contents
 from gym_mara.datasets.episode import Episode
-from gym_mara.datasets.recording import Recorded, record, recording_seeds
+from gym_mara.datasets.playing import record, recording_seeds
+from gym_mara.datasets.recorder import Recorded
 from gym_mara.envs import MaraEnv, MaraGoalEnv
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
@@ -50,7 +51,8 @@ def _short_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MARA-v0", "MARAReach-v0", "MARAGoal-v0", "MARACollision-v0"):
         short = ENVIRONMENTS[name]._replace(max_episode_steps=LENGTH)
         monkeypatch.setitem(ENVIRONMENTS, name, short)
-    monkeypatch.setattr(recording, "writer_class", lambda name: Kept)
+    monkeypatch.setattr(playing, "writer_class", lambda name: Kept)
+    monkeypatch.setattr(recorder, "writer_class", lambda name: Kept)
 
 
 def ik(env: str, **options: Any) -> sources.Source:
@@ -97,7 +99,7 @@ def test_an_episode_depends_on_its_number_and_the_seed_alone(
         return np.array([episode.observations[0] for episode in Kept.episodes])
 
     side_by_side = starts(1)
-    monkeypatch.setattr(recording, "_MOST_ARMS", 2)
+    monkeypatch.setattr(playing, "_MOST_ARMS", 2)
     np.testing.assert_allclose(starts(1), side_by_side, atol=1e-12)
     assert (starts(2) != side_by_side).any(axis=1).all()
 
@@ -209,7 +211,7 @@ def test_a_folder_that_appears_meanwhile_is_kept(
         ),
         ("--policy ik --out there", "exists and is not overwritten"),
         ("--policy ik --out none/new-v0", "make it first"),
-        ("--policy nothing --out new-v0", "is no run folder, and neither ik, pretrained nor"),
+        ("--policy nothing --out new-v0", "is no run folder, and neither ik, hand, pretrained nor"),
         ("--policy there --out new-v0", "config.json"),
         ("--policy ik --out new-v0 --pixels 64 --set width=64", "leave out --set width"),
         ("--policy ik --out new-v0 --set camera=top", "no picture is drawn"),

@@ -1,10 +1,9 @@
-"""Records episodes as a data set: whole, or not at all."""
+"""Plays episodes, many side by side, and records them as a data set."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,36 +12,18 @@ from gym_mara.agents.evaluation.rollout import Begin
 from gym_mara.agents.runs.evaluation import make_arms
 from gym_mara.datasets.contents import Contents, contents_of
 from gym_mara.datasets.episode import Episode, Steps
-from gym_mara.datasets.formats import Writer, writer_class
+from gym_mara.datasets.formats import writer_class
+from gym_mara.datasets.recorder import MOST_EPISODES, Recorded, recorder
 from gym_mara.datasets.sources import Source
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import whole_number
-from gym_mara.files import folder_written_aside, writing
 from gym_mara.registration import environment
 from gym_mara.rendering import Pictures
 
-MOST_EPISODES = 100_000
 _MOST_ARMS = 64
 """So many episodes are played side by side; more would take more memory, and hardly less time."""
 _RECORDING = 1
 """Tells the seeds of data sets apart from those of evaluations, which have no second number."""
-
-
-@dataclass
-class Recorded:
-    """What a data set holds."""
-
-    episodes: int = 0
-    steps: int = 0
-    successes: int | None = None
-    """How many episodes end in success; None if the task has no tolerances of success."""
-
-    def count(self, episode: Episode) -> None:
-        """Count an episode."""
-        self.episodes += 1
-        self.steps += len(episode.rewards)
-        if episode.success is not None:
-            self.successes = (self.successes or 0) + int(episode.success[-1])
 
 
 def recording_seeds(seed: int, first: int, count: int) -> list[int]:
@@ -54,38 +35,6 @@ def recording_seeds(seed: int, first: int, count: int) -> list[int]:
         np.random.SeedSequence(seed, spawn_key=(first + i, _RECORDING)) for i in range(count)
     )
     return [int(sequence.generate_state(1, np.uint64)[0] >> 1) for sequence in sequences]
-
-
-@contextmanager
-def recorder(
-    form: str, folder: Path, contents: Contents
-) -> Iterator[tuple[Callable[[Episode], None], Recorded]]:
-    """Yield what writes an episode into a new data set, and its counts. The folder appears if the block succeeds.
-
-    Args:
-        form: one of FORMATS.
-        folder: a new folder.
-        contents: what the episodes have in common.
-
-    Raises:
-        GymMaraError: the folder exists or cannot be written, the disk is full, or the format cannot store this; then nothing
-            is left.
-        MissingExtraError: a library is not installed.
-    """
-    write, recorded = writer_class(form), Recorded()
-    with folder_written_aside(folder) as aside:
-        with writing(folder):
-            writer: Writer = write(aside, folder.name, contents)
-        with closing(writer):
-
-            def add(episode: Episode) -> None:
-                with writing(folder):
-                    writer.add(episode)
-                recorded.count(episode)
-
-            yield add, recorded
-            with writing(folder):
-                writer.finish()
 
 
 def record(
