@@ -7,7 +7,7 @@ READY = $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 PIP_INSTALL = -m pip install --quiet --disable-pip-version-check --no-compile
 
-.PHONY: demo test test-slow lint docs docs-links bench experiment test-kilted test-oldest test-rllib test-wheel clean
+.PHONY: demo test test-slow lint docs docs-links bench experiment test-kilted test-lerobot test-oldest test-rllib test-wheel clean
 
 demo: $(READY) ## Train PPO on MARA-v0, evaluate it, save a run folder under runs/.
 	$(BIN)/gym-mara train --env MARA-v0 --algo ppo --steps 3e5
@@ -47,6 +47,12 @@ test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and 
 test-kilted: .venv-kilted/.ready ## Run the tests that speak ROS 2 with the wheels of Kilted; all others use those of Jazzy.
 	.venv-kilted/bin/python -m pytest -n auto -m "not nightly" $(ROS_TESTS)
 
+test-lerobot: .venv-lerobot/.ready ## Read recorded data sets with LeRobot's own loader; LeRobot and its CUDA take gigabytes, so CI does not.
+	rm -rf .venv-lerobot/sets && mkdir .venv-lerobot/sets
+	$(BIN)/gym-mara record --policy ik --env MARAReach-v0 --format lerobot --episodes 60 --out .venv-lerobot/sets/reach
+	$(BIN)/gym-mara record --policy ik --env MARAGoal-v0 --format lerobot --episodes 3 --pixels 64 --out .venv-lerobot/sets/goal
+	for set in reach goal; do HF_HUB_OFFLINE=1 .venv-lerobot/bin/python tests/datasets/read_with_lerobot.py .venv-lerobot/sets/$$set || exit 1; done
+
 test-rllib: .venv-rllib/.ready ## Run the RLlib example, which pins an older Gymnasium, with that one.
 	.venv-rllib/bin/python examples/rllib_ppo.py --steps 600
 
@@ -54,7 +60,7 @@ test-wheel: ## Build the wheel, install it outside the checkout, and use every e
 	.ci/test-wheel $(PYTHON)
 
 clean: ## Remove the virtual environments and the files of the tools.
-	rm -rf docs/_build .venv .venv-bench .venv-docs .venv-kilted .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf docs/_build .venv .venv-bench .venv-docs .venv-kilted .venv-lerobot .venv-oldest .venv-rllib build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 CONSTRAINTS ?= constraints.txt
 EXTRAS ?= dev
@@ -96,6 +102,12 @@ endef
 	$(PYTHON) -m venv $(@D)
 	$(@D)/bin/python $(PIP_INSTALL) --no-deps gymnasium==1.2.2 ormsgpack pyarrow tensorboardX
 	$(OTHERS_FROM_VENV)
+	touch $@
+
+# LeRobot pins versions of torch, packaging and others that are not those of $(VENV), and reads the files alone.
+.venv-lerobot/.ready:
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python $(PIP_INSTALL) lerobot==0.4.4
 	touch $@
 
 .venv-kilted/.ready: $(READY)

@@ -187,6 +187,28 @@ def written_aside(file: Path, *, new: bool = False) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def folder_written_aside(folder: Path) -> Iterator[Path]:
+    """Yield a new temporary folder beside a new one, whose name it gets if the block succeeds.
+
+    Raises:
+        GymMaraError: the folder exists, or cannot be written; then nothing is left.
+    """
+    if os.path.lexists(folder):
+        raise _exists(folder)
+    temporary = folder.with_name(f".{folder.name}-{secrets.token_hex(8)}")
+    try:
+        with writing(folder):
+            temporary.mkdir()
+        yield temporary
+        with writing(folder):
+            if os.path.lexists(folder):
+                raise _exists(folder)
+            os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def refuse_links(folder: Path) -> None:
     """Check that a folder which is written to holds no symbolic links: they may lead out of it.
 

@@ -100,6 +100,7 @@ def _prepare() -> None:
     from gym_mara.agents.export import run  # noqa: F401
     from gym_mara.agents.inspection import report
     from gym_mara.agents.training.train import use_one_thread
+    from gym_mara.datasets.hand import HandViewer
     from gym_mara.viewer.viewer import Viewer
 
     def run_here(jobs: Mapping[str, Job], on_message: OnMessage, processes: int) -> dict[str, str]:
@@ -114,6 +115,7 @@ def _prepare() -> None:
     vars(local_executor)["run_in_processes"] = vars(search)["run_in_processes"] = run_here
     vars(report)["_VIDEO_SECONDS"] = 0.1
     setattr(Viewer, "run", interrupted)  # noqa: B010
+    setattr(HandViewer, "episode", interrupted)  # noqa: B010
     use_one_thread()
     _wait_for_no_arm()
 

@@ -127,7 +127,9 @@ VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
     "backend": ["pinocchio", "pinocchio", "dart", "mujoco", "warp", "ros2"],
-    "policy": ["last", "best", "pretrained", "policy.onnx"],
+    "policy": ["last", "best", "pretrained", "policy.onnx", "run", "ik", "hand"],
+    "format": ["minari", "lerobot"],
+    "pixels": ["32", "64"],
     "start": ["run"],
     "from_policy": ["last", "best"],
     "preset": preset_names(),
@@ -147,7 +149,7 @@ VALID: dict[str, Sequence[str]] = {
     "run": ["run"],
     "resume": ["run"],
     "folder": ["grid"],
-    "out_folder": ["new", "new/deep"],
+    "out_folder": ["new", "new/deep", "new-v0"],
     "out_file": ["new.html"],
     "video": ["new.gif", "new.mp4"],
     "file": ["mara", "ur5"],
@@ -176,6 +178,7 @@ VALID: dict[str, Sequence[str]] = {
 }
 """Values of a parameter by its name, or by those of the command and the parameter."""
 FORCED = {
+    "record": ["policy", "out_folder", "episodes"],
     "train": ["steps"],
     "benchmark": ["env", "algo", "steps", "seeds", "out_folder"],
     "search": ["env", "algo", "steps", "trials", "seeds", "jobs", "out_folder"],
@@ -185,7 +188,7 @@ FORCED = {
     "ros2 replay": ["rate"],
     "ros2 sim": ["seconds"],
 }
-"""Options without which a call would train for long, or would not end."""
+"""Options without which a call would take long, do nothing, or would not end."""
 RARE = ("report", "search", "benchmark")
 """Commands that take seconds even with the smallest numbers."""
 

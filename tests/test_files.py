@@ -17,6 +17,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.files import (
     DamagedFileError,
     MissingFileError,
+    folder_written_aside,
     read_bytes,
     read_json,
     read_text,
@@ -149,6 +150,29 @@ def test_an_interrupt_leaves_the_old_file(tmp_path: Path) -> None:
         interrupted()
     assert file.read_text() == "old"
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    with folder_written_aside(tmp_path / "new") as aside:
+        (aside / "file").write_text("whole")
+        assert not (tmp_path / "new").exists()
+    assert (tmp_path / "new" / "file").read_text() == "whole"
+
+    def interrupted() -> None:
+        with folder_written_aside(tmp_path / "other") as aside:
+            (aside / "file").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(GymMaraError, match="not overwritten"), folder_written_aside(tmp_path):
+        pass
+    with (
+        pytest.raises(GymMaraError, match="make it first"),
+        folder_written_aside(tmp_path / "none" / "new"),
+    ):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
 def test_a_device_or_a_missing_folder_cannot_be_written(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from gym_mara.cli import (
     environments,
     experiments,
     identify,
+    recording,
     robots,
     training,
     viewing,
@@ -46,6 +47,7 @@ app.command()(training.train)
 app.command()(agents.evaluate)
 app.command()(agents.transfer)
 app.command()(agents.export)
+app.command()(recording.record)
 app.command()(viewing.watch)
 app.command()(viewing.report)
 app.command()(experiments.benchmark)

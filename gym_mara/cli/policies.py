@@ -13,16 +13,17 @@ from gym_mara.pretrained import pretrained_file
 
 RUN_POLICIES = ("last", "best")
 PRETRAINED = "pretrained"
-_ENDING = ".onnx"
+ONNX = ".onnx"
+"""The ending of exported policies."""
 _OF_RUN = "last, or best: the policy with the highest reward in the evaluations of the training"
 
 
 def _any_policy(text: str) -> str:
     valid = (*RUN_POLICIES, PRETRAINED)
-    if text in valid or text.endswith(_ENDING):
+    if text in valid or text.endswith(ONNX):
         return text
     raise typer.BadParameter(
-        f"{unknown('policy', text, valid)} Or name a file that ends in {_ENDING}."
+        f"{unknown('policy', text, valid)} Or name a file that ends in {ONNX}."
     )
 
 

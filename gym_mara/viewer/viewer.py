@@ -74,6 +74,7 @@ class Viewer:
         self._panel = Panel(self._server, simulation, view.q)
         for control, check in self._panel.checks():
             gate.let_in(control, check)
+        self._gate = gate
         self._connect_controls()
 
     def run(self, policy: Callable[[Any], ArrayLike | None], episode_steps: int | None) -> None:
@@ -101,13 +102,7 @@ class Viewer:
             GymMaraError: the action has the wrong shape or is not finite.
         """
         self._wait()
-        simulation = self._simulation
-        if self._jogging:
-            outcome = simulation.step_towards(self._panel.targets())
-        elif action is None:
-            outcome = simulation.step_towards(simulation.robot.home[None])
-        else:
-            outcome = simulation.step(action)
+        outcome = self._move(action)
         self._panel.add(outcome)
         now = time.monotonic()
         if now - self._drawn >= _FRAME_PERIOD or not self._playing:
@@ -117,6 +112,15 @@ class Viewer:
             with sender_errors_ignored():
                 self._panel.update(self._simulation, follow=not self._jogging)
         return outcome
+
+    def _move(self, action: ArrayLike | None) -> Outcome:
+        """Step as the user or the program wants."""
+        simulation = self._simulation
+        if self._jogging:
+            return simulation.step_towards(self._panel.targets())
+        if action is None:
+            return simulation.step_towards(simulation.robot.home[None])
+        return simulation.step(action)
 
     def show(self) -> None:
         """Draw the arm in its current state, and the target if the program has moved it, as a new episode does."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gym_mara.agents.evaluation.rollout import Begin
 from gym_mara.agents.runs.evaluation import measure_acting
-from gym_mara.envs.actions import AbsoluteActions, RelativeActions
+from gym_mara.envs.actions.straight import StraightActions
 from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.robot.inverse_kinematics import solve_ik
@@ -34,10 +34,7 @@ class StraightMove:
     def __init__(self, simulation: Simulation) -> None:
         task, robot, backend = simulation.task, simulation.robot, simulation.backend
         actions, state = simulation.actions, backend.state
-        if not isinstance(actions, (AbsoluteActions, RelativeActions)):
-            raise GymMaraError(
-                f"a straight joint move has no {actions.mode} actions: give action=relative or action=absolute"
-            )
+        self._move = StraightActions(simulation)
         state.fill_actions(actions.action, actions.last_action)
         if "position_error" not in simulation.rewards(state)[1]:
             raise GymMaraError(
@@ -46,10 +43,6 @@ class StraightMove:
             )
         self._simulation = simulation
         self._goal = self._found(state.q.clip(robot.lower, robot.upper))
-        # How far ahead of a joint its target must be for the joint to move at its limit in the next period.
-        gain = backend.servo_gain
-        lead = backend.control_period + (0.0 if gain is None else 1.0 / gain)
-        self._reach = backend.joint_velocity * lead
 
     def _found(self, start: Floats) -> Floats:
         """The configurations (N, J) to move to from the start (N, J), rad (m)."""
@@ -69,20 +62,7 @@ class StraightMove:
 
     def __call__(self, observation: Any) -> Floats:
         """The actions (N, J) of the next step."""
-        q, actions = self._simulation.backend.state.q, self._simulation.actions
-        way = self._goal - q
-        target = q + way / np.maximum(_most(way, self._reach), 1.0)
-        if not isinstance(actions, RelativeActions):
-            return target
-        step, scale = target - actions.origin, actions.steps * actions.pace
-        step = step / np.maximum(_most(step, scale), 1.0)
-        return np.divide(step, scale, out=np.zeros_like(step), where=scale > 0.0)
-
-
-def _most(values: Floats, of: Floats) -> Floats:
-    """The largest ratio of an arm's values (N, J) to those of its joints that are not zero, (J,) or (N, J), as a column."""
-    ratio = np.divide(np.abs(values), of, out=np.zeros_like(values), where=of > 0.0)
-    return ratio.max(axis=1, keepdims=True)
+        return self._move.to(self._goal)
 
 
 BASELINES: dict[str, Begin] = {"ik": StraightMove}

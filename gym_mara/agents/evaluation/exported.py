@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gym_mara.agents.evaluation.rollout import Act
+from gym_mara.agents.evaluation.rollout import Act, Begin
 from gym_mara.agents.runs.evaluation import measure_acting
 from gym_mara.deploy import OnnxPolicy
 from gym_mara.deploy.environment import check_fits
@@ -30,11 +30,17 @@ def evaluate_exported(
     Raises:
         GymMaraError: the policy does not fit the environment, a name is unknown, or a value is out of its range.
     """
+    others = dict(options)
+    backend = others.pop("backend")
+    begin = begin_exported(policy)
+    return measure_acting(begin, env, backend, others, episodes=episodes, seed=seed)
+
+
+def begin_exported(policy: OnnxPolicy) -> Begin:
+    """Lets an exported policy act, in environments that it fits; it refuses others with a GymMaraError."""
 
     def begin(simulation: Simulation) -> Act:
         check_fits(policy.about, simulation)
         return lambda observation: policy.predict(observation)[0]
 
-    others = dict(options)
-    backend = others.pop("backend")
-    return measure_acting(begin, env, backend, others, episodes=episodes, seed=seed)
+    return begin

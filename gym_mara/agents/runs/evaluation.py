@@ -30,21 +30,27 @@ RANDOM_EPISODES = 5
 
 
 def make_arms(
-    env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: int | None
+    env: str,
+    backend: str,
+    num_envs: int,
+    options: dict[str, Any],
+    *,
+    autoreset_mode: str = "SameStep",
+    **limit: Any,
 ) -> MaraVectorEnv:
     """N arms of an environment, in at most `workers` processes, a divisor of N; `limit` may be `max_episode_steps`."""
     workers = options.get("workers")
     if type(workers) is int and workers > 0:
         options = {**options, "workers": math.gcd(workers, num_envs)}
     arms = make_vector_env(
-        env, num_envs, backend=backend, autoreset_mode="SameStep", **limit, **options
+        env, num_envs, backend=backend, autoreset_mode=autoreset_mode, **limit, **options
     )
     require_numpy(arms)
     return arms
 
 
 def make_env(
-    env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: int | None
+    env: str, backend: str, num_envs: int, options: dict[str, Any], **limit: Any
 ) -> MaraVecEnv:
     """N arms of an environment for the agents of the presets, with actions in [-1, 1]."""
     arms = make_arms(env, backend, num_envs, options, **limit)
