@@ -54,7 +54,7 @@ def test_every_command_has_help(gym_mara: Cli, command: str) -> None:
 def test_the_help_comes_from_the_registry(gym_mara: Cli) -> None:
     _, out, _ = gym_mara("train", "--help")
     assert f"Algorithm: {', '.join(ALGORITHMS)}." in out
-    assert "Hyperparameters: tuned or paper." in out
+    assert "Hyperparameters: tuned or paper or robust." in out
 
 
 def test_a_setting_that_looks_like_json_must_be_json(gym_mara: Cli, tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_the_steps_that_were_trained_are_printed_if_they_are_more(
 def test_an_interrupt_before_there_is_a_run_says_that_nothing_is_saved(
     gym_mara: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*arguments: object) -> None:
+    def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gym_mara.agents.training.train.train", interrupted)

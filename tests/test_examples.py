@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CALLS = {
+    "behaviour_cloning.py --episodes 8 --evaluate 4": "success",
     "sb3_ppo.py --way single": "position error",
     "sb3_ppo.py --way in_turn": "position error",
     "sb3_ppo.py --way in_processes": "position error",

@@ -10,7 +10,7 @@ import numpy as np
 
 from gym_mara.agents.evaluation.rollout import Begin
 from gym_mara.agents.runs.evaluation import make_arms
-from gym_mara.datasets.contents import Contents, contents_of
+from gym_mara.datasets.contents import contents_of
 from gym_mara.datasets.episode import Episode, Steps
 from gym_mara.datasets.formats import writer_class
 from gym_mara.datasets.recorder import MOST_EPISODES, Recorded, recorder
@@ -75,24 +75,23 @@ def record(
     with closing(arms):
         keywords = {"backend": source.backend, **source.keywords}
         contents = contents_of(arms.simulation, source.env, keywords, source.policy, pixels)
+        pictures = Pictures(arms.simulation.robot, contents.pictures) if contents.pictures else None
         with recorder(form, folder, contents) as (add, recorded):
             for first in range(0, count, arms.num_envs):
                 seeds = recording_seeds(seed, first, arms.num_envs)
-                for episode in _play(arms, source.begin, contents, seeds, count - first):
+                for episode in _play(arms, source.begin, pictures, seeds, count - first):
                     add(episode)
     return recorded
 
 
 def _play(
-    arms: MaraVectorEnv, begin: Begin, contents: Contents, seeds: list[int], wanted: int
+    arms: MaraVectorEnv, begin: Begin, pictures: Pictures | None, seeds: list[int], wanted: int
 ) -> Iterator[Episode]:
     """Play an episode with each arm; yield those of the first arms, as many as are wanted."""
-    simulation, pictures = arms.simulation, None
-    if contents.pictures is not None:
-        pictures = Pictures(simulation.robot, contents.pictures)
+    simulation = arms.simulation
     observation, _ = arms.reset(seed=seeds)
     steps, act = Steps(simulation, observation, pictures), begin(simulation)
-    low, high = contents.action_space.low, contents.action_space.high
+    low, high = simulation.action_space.low, simulation.action_space.high
     lengths = np.zeros(arms.num_envs, np.int64)
     while not lengths.all():
         # In the precision of the data set, so that its actions are the ones that the arms made.
@@ -106,5 +105,3 @@ def _play(
             observation, _ = arms.reset(options={"reset_mask": ended})
     for arm in range(min(wanted, arms.num_envs)):
         yield steps.episode(arm, int(lengths[arm]), seeds[arm])
-    if pictures is not None:
-        pictures.close()

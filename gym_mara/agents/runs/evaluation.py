@@ -104,15 +104,11 @@ class Player:
         except BaseException:
             self.env.close()
             raise
-        self._act = self.policy.begin(self.env.simulation)
-
-    def act(self, observation: Floats) -> Floats:
-        """The actions (N, A) for the next observations (N, O) of the arms."""
-        return self._act(observation)
+        self._act = self.begin(self.env.simulation)
 
     def step(self) -> Outcome:
         """Let the policy act for one step; the outcome holds the state that the task judged."""
-        self._observation, *_ = self.env.step(self.act(self._observation))
+        self._observation, *_ = self.env.step(self._act(self._observation))
         outcome = self.env.simulation.outcome
         assert outcome is not None
         return outcome

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from gym_mara.agents.evaluation.episodes import episode_seeds
-from gym_mara.agents.evaluation.rollout import roll_out
+from gym_mara.agents.evaluation.rollout import Act, roll_out
 from gym_mara.agents.runs.evaluation import Player
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.envs.simulation import Simulation
 from gym_mara.types import Floats
 
 COLLIDING_Q = (0.0, 2.3, 1.3, 0.0, 0.0, 0.0)
@@ -22,6 +23,9 @@ class Alternating(Player):
     """It goes to a colliding configuration in every second step, and home in the others."""
 
     count = 0
+
+    def begin(self, simulation: Simulation) -> Act:
+        return self.act
 
     def act(self, observation: Floats) -> Floats:
         self.count += 1

@@ -13,6 +13,7 @@ import tempfile
 import time
 import urllib.request
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from gym_mara.agents.evaluation.baselines import StraightMove
 from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
@@ -28,9 +28,15 @@ from gym_mara.agents.inspection.watch import film_run, film_targets, watch_run
 from gym_mara.agents.runs.evaluation import Player
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
+from gym_mara.collision.coal import CoalChecker
+from gym_mara.collision.free_poses import straight_move
+from gym_mara.envs.actions.straight import StraightActions
 from gym_mara.envs.outcome import Outcome
 from gym_mara.errors import GymMaraError, MissingExtraError
 from gym_mara.rendering.film import Film, labelled
+from gym_mara.robot import RobotModel
+from gym_mara.robot.inverse_kinematics import solve_ik
+from gym_mara.types import Floats
 from tests.agents.conftest import ROLLOUT, config, silent
 from tests.browser import chromium
 from tests.deploy.models import solving
@@ -126,21 +132,33 @@ class Steps:
             return labelled(picture, text)
 
         monkeypatch.setattr(Player, "step", noted_step)
-        monkeypatch.setattr(Player, "act", act)
+        monkeypatch.setattr(Player, "begin", lambda player, _: partial(act, player))
         monkeypatch.setattr(watch_module, "labelled", noted_label)
+
+
+def _with_a_free_way(robot: RobotModel, here: Floats, position: Floats) -> Floats:
+    """A configuration (1, J) for a position, to which the straight move from here is free."""
+    rng, checker = np.random.default_rng(0), CoalChecker(robot)
+    for start in (here, *rng.uniform(robot.lower, robot.upper, (100, robot.num_joints))):
+        q = solve_ik(robot, position, None, start=start)
+        exact = np.abs(robot.kinematics().pose(q[None])[0][0] - position).max() < 1e-3
+        if exact and not checker.check(np.vstack([straight_move(here, q), q])).any():
+            return q[None]
+    raise AssertionError(f"no way from {here} to {position} was found")
 
 
 def test_in_a_film_of_targets_the_arm_goes_on_from_each_that_it_has_reached(
     random_target_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    moves: dict[bytes, StraightMove] = {}
+    goals: dict[bytes, Any] = {}
 
     def straight(player: Player, observation: Any) -> Any:
         simulation = player.env.simulation
         target = simulation.goal.position.tobytes()
-        if target not in moves:
-            moves[target] = StraightMove(simulation)
-        return moves[target](observation)
+        if target not in goals:
+            here = simulation.backend.state.q[0]
+            goals[target] = _with_a_free_way(simulation.robot, here, simulation.goal.position[0])
+        return StraightActions(simulation).to(goals[target])
 
     steps, film = Steps(monkeypatch, straight), tmp_path / "film.gif"
     film_targets(random_target_run, film, "pinocchio", SMALL, targets=3, rate=5.0)
