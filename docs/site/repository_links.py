@@ -13,6 +13,7 @@ PAGES = {
     "README.md": "start.md",
     "CHANGELOG.md": "repository/changelog.md",
     "CONTRIBUTING.md": "repository/contributing.md",
+    "SECURITY.md": "repository/security.md",
     "examples/lag_backend/README.md": "repository/lag_backend.md",
     "robots/mara/README.md": "repository/mara.md",
 }

@@ -22,6 +22,10 @@ from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS
 from tests.helpers import Cli
 
+# The libraries that read films leave pipes open.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
 LENGTH = 4
 OPTIONS = {"max_joint_velocity": 1.5}
 COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
