@@ -19,6 +19,9 @@ PRIORS = {
     "mass": (0.3, 3.0),
 }
 """Where each parameter may lie, as in `randomisation`; joint friction as parts of the joint's effort limit."""
+_BY_LOGARITHM = ("servo_gain", "mass")
+"""Parameters that are searched by their logarithms. Effort limits are not: what counts most is their difference to the
+friction, and where it stays the same the search should move on a straight line."""
 DEFAULT = ("latency", "servo_gain", "effort_limit", "joint_friction")
 
 
@@ -49,8 +52,8 @@ class Space:
         bounds = np.array([self._bounds(*entry) for entry in self.entries])
         self.low, self.high = bounds.T
         """The prior ranges (P,)."""
-        self.positive = np.array([PARAMETERS[name].positive for name, _ in self.entries])
-        """Which entries (P,) are positive; they are searched by their logarithms."""
+        self.by_logarithm = np.array([name in _BY_LOGARITHM for name, _ in self.entries])
+        """Which entries (P,) are searched by their logarithms."""
         nominal = [self._nominal(name)[joint or 0] for name, joint in self.entries]
         self.nominal = np.clip(nominal, self.low, self.high)
         """The robot's own values (P,)."""
@@ -82,20 +85,20 @@ class Space:
     def stretched(self, vectors: Floats) -> Floats:
         """Vectors (…, P) in the coordinates of the search, in which prior ranges have the length 1, or some for a logarithm."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.positive, np.log(vectors), vectors / self.high)
+            return np.where(self.by_logarithm, np.log(vectors), vectors / self.high)
 
     def natural(self, coordinates: Floats) -> Floats:
         """The vectors (…, P) with these coordinates."""
-        return np.where(self.positive, np.exp(coordinates), coordinates * self.high)
+        return np.where(self.by_logarithm, np.exp(coordinates), coordinates * self.high)
 
     def slope(self, vector: Floats) -> Floats:
         """How much the entries of a vector (P,) change with their coordinates."""
-        return np.where(self.positive, vector, self.high)
+        return np.where(self.by_logarithm, vector, self.high)
 
     def inside(self, vector: Floats) -> Floats:
         """A vector (…, P) moved to a little within the prior ranges."""
         room = 0.01 * (self.high - self.low)
-        low, high = np.where(self.positive, 1.01 * self.low, self.low + room), self.high - room
+        low, high = np.where(self.by_logarithm, 1.01 * self.low, self.low + room), self.high - room
         return np.clip(vector, low, high)
 
     def effort_limit(self, index: int) -> float:

@@ -57,10 +57,10 @@ class Search:
         self.measure(segment)
 
         def residuals(coordinates: Floats) -> Floats:
-            return self.residuals(self._vectors(coordinates[None])[0], segment)
+            return self.residuals(self.vectors(coordinates[None])[0], segment)
 
         def jacobian(coordinates: Floats) -> Floats:
-            return self.jacobian(self._vectors(coordinates[None])[0], segment, rough=rough)
+            return self.jacobian(self.vectors(coordinates[None])[0], segment, rough=rough)
 
         low, high = space.stretched(space.low)[own], space.stretched(space.high)[own]
         result = least_squares(
@@ -74,7 +74,7 @@ class Search:
             loss="soft_l1" if rough else "linear",
             max_nfev=evaluations,
         )
-        self.vector = self._vectors(result.x[None])[0]
+        self.vector = self.vectors(result.x[None])[0]
 
     def measure(self, segment: float = math.inf) -> None:
         """Note the error of each joint."""
@@ -121,7 +121,7 @@ class Search:
         moved = np.tile(coordinates, (1 + len(groups), 1))
         for row, columns in enumerate(groups.values(), 1):
             moved[row, columns] += steps[columns]
-        errors = self.errors(self._vectors(moved), segment)
+        errors = self.errors(self.vectors(moved), segment)
         derivatives = np.zeros((*errors.shape[1:], len(own)))
         for row, columns in enumerate(groups.values(), 1):
             for column in columns:
@@ -131,7 +131,7 @@ class Search:
                 derivatives[:, seen, column] = change / steps[column]
         return derivatives
 
-    def _vectors(self, coordinates: Floats) -> Floats:
+    def vectors(self, coordinates: Floats) -> Floats:
         """Whole vectors (M, P) from the coordinates (M, S) that are searched."""
         whole = np.zeros((len(coordinates), len(self.vector)))
         whole[:, self.searched] = coordinates

@@ -17,6 +17,10 @@ _CLUSTER = 1.0
 """Errors less than this apart, s, are not taken to be independent."""
 _TINY = 1e-6
 """A parameter that moves no joint by this part of its error is not determined."""
+_ROUNDS = 3
+"""How often uncertain directions are measured, each time over the standard errors that were found before."""
+_WEAK, _LONGEST = 1e-2, 0.3
+"""A standard error, in the coordinates of the search, from which on a direction is measured, and the longest step."""
 _SCALED = ("effort_limit", "joint_friction", "mass")
 """Parameters whose multiples move the arm alike."""
 _SCALE = 1.2
@@ -84,7 +88,7 @@ def standard_errors(search: Search, log: Log) -> Floats:
     alike (the sandwich estimator with clusters). That of the latency has the deviation of a physics step as well.
     """
     space, own = search.space, search.searched
-    jacobian, residuals = search.jacobian(search.vector), search.residuals(search.vector)
+    jacobian, residuals = _derivatives(search), search.residuals(search.vector)
     _, lengths, directions = np.linalg.svd(jacobian, full_matrices=False)
     known = lengths > _TINY * math.sqrt(len(residuals))
     with np.errstate(divide="ignore"):
@@ -107,3 +111,38 @@ def standard_errors(search: Search, log: Log) -> Floats:
     # A motor at its limit feels a target only from the next physics step on.
     errors[space.of("latency")] += search.physics_step / math.sqrt(12.0)
     return errors
+
+
+def _derivatives(search: Search) -> Floats:
+    """The derivatives of the residuals ((T - 1) J, S), those of uncertain directions over two standard errors.
+
+    Finite differences with short steps see small jumps, where friction sticks and slips. Where the log hardly shows a
+    parameter, they would pass for knowledge of it.
+    """
+    jacobian = search.jacobian(search.vector)
+    space, own = search.space, search.searched
+    middle = space.stretched(search.vector)[own]
+    low, high = space.stretched(space.low)[own], space.stretched(space.high)[own]
+    for _ in range(_ROUNDS):
+        _, lengths, directions = np.linalg.svd(jacobian, full_matrices=False)
+        weak = lengths * _WEAK < 1.0
+        if not weak.any():
+            break
+        ways = directions[weak]
+        steps = np.minimum(1.0 / np.maximum(lengths[weak], 1e-9), _LONGEST)[:, None] * ways
+        ends = np.stack(
+            [middle + _within(sign * steps, low - middle, high - middle) for sign in (1, -1)]
+        )
+        widths = ((ends[0] - ends[1]) * ways).sum(axis=1)
+        errors = search.errors(search.vectors(ends.reshape(-1, len(own)))) / search.deviation
+        ahead, behind = errors.reshape(2, len(ways), -1)
+        measured = (ahead - behind) / np.maximum(widths, 1e-9)[:, None]
+        jacobian = jacobian + (measured.T - jacobian @ ways.T) @ ways
+    return np.asarray(jacobian)
+
+
+def _within(steps: Floats, low: Floats, high: Floats) -> Floats:
+    """Steps (K, S), those that do not end within these ends (S,) made shorter."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(steps > 0.0, high / steps, np.where(steps < 0.0, low / steps, np.inf))
+    return steps * np.clip(room.min(axis=1, keepdims=True), 0.0, 1.0)

@@ -68,6 +68,11 @@ def test_three_joints(mara: RobotModel) -> None:
     for each in found.estimates:
         own = true[each.name]
         value = float(own if each.joint is None else own[mara.joint_names.index(each.joint)])
+        if each.joint == "motor3" and each.name != "servo_gain":
+            # It never brakes at its limit here, so that only what friction leaves of the effort shows.
+            assert str(each.undetermined).startswith("too uncertain")
+            assert each.low < value < each.high
+            continue
         assert each.standard_error is not None
         if each.name == "latency":
             assert each.value == pytest.approx(value, abs=0.02)
