@@ -3,7 +3,7 @@
 The data set is that of gym-mara record, with observations that are arrays. Without one, episodes of inverse kinematics on
 MARAReach-v0 are recorded first.
 
-    python examples/behaviour_cloning.py --data reach-v0 --steps 20000
+    python examples/behaviour_cloning.py --data data/reach-v0
 """
 
 from __future__ import annotations
@@ -52,18 +52,27 @@ class Clone(nn.Module):
     def act(self, observations: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same, as the environment takes them."""
         with torch.no_grad():
-            return np.array(self(torch.tensor(observations).float()), np.float64)
+            actions: Tensor = self(torch.tensor(observations).float())
+        return actions.numpy().astype(np.float64)
 
 
 def pairs(data: Any) -> tuple[Tensor, Tensor]:
-    """The observations (S, O) and the actions (S, A) of the episodes that end in success."""
-    good = data.filter_episodes(lambda episode: bool(episode.infos["success"][-1]))
-    episodes = list(good.iterate_episodes())
-    if not episodes:
+    """The observations (S, O) and the actions (S, A) of the episodes that end in success, until the arm is there.
+
+    After that inverse kinematics follows its own rounding errors, with actions that nobody can learn.
+    """
+    observations, actions = [], []
+    for episode in data.iterate_episodes():
+        success = episode.infos["success"]
+        if success[-1]:
+            steps = int(np.argmax(success))
+            observations.append(episode.observations[:steps])
+            actions.append(episode.actions[:steps])
+    if not observations:
         raise SystemExit("no episode of the data set ends in success: nothing to imitate")
-    columns = ([e.observations[:-1] for e in episodes], [e.actions for e in episodes])
-    observations, actions = (torch.tensor(np.concatenate(c)).float() for c in columns)
-    return observations, actions
+    columns = (np.concatenate(each) for each in (observations, actions))
+    of_steps, acted = (torch.tensor(column).float() for column in columns)
+    return of_steps, acted
 
 
 def clone(observations: Tensor, actions: Tensor, steps: int) -> Clone:
@@ -87,9 +96,9 @@ def main() -> None:
     """Record a data set if none is given, train, and evaluate in episodes that are not in it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, help="a data set of gym-mara record --format minari")
-    parser.add_argument("--episodes", type=int, default=200, help="to record without --data")
-    parser.add_argument("--steps", type=int, default=20_000, help="of the optimiser")
-    parser.add_argument("--evaluate", type=int, default=100, help="episodes of the evaluation")
+    parser.add_argument("--episodes", type=int, default=1000, help="to record without --data")
+    parser.add_argument("--steps", type=int, default=10_000, help="of the optimiser")
+    parser.add_argument("--evaluate", type=int, default=1000, help="episodes of the evaluation")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = arguments.data or Path(folder) / "ik-v0"

@@ -71,7 +71,7 @@ def contents_of(
         )
         box = Box(0, 255, (pixels, pixels, 3), np.uint8)
         if isinstance(space, Dict):
-            space = Dict({PIXELS: box, **space.spaces}, sort_keys=space.sort_keys)
+            space = Dict({PIXELS: box, **space.spaces})
         else:
             space = Dict({STATE: space, PIXELS: box})
         keywords = {**keywords, "render_mode": "rgb_array", "width": pixels, "height": pixels}

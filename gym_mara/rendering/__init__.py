@@ -102,5 +102,6 @@ class Pictures:
 
 def _free(key: int, *, wait: bool) -> None:
     """Free a renderer, if a picture was ever drawn; else import nothing."""
-    if drawing := sys.modules.get("gym_mara.rendering.drawing"):
-        drawing.free(key, wait=wait)
+    # The garbage collector may call this in the middle of the import of that module.
+    if free := getattr(sys.modules.get("gym_mara.rendering.drawing"), "free", None):
+        free(key, wait=wait)

@@ -9,6 +9,7 @@ import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -17,10 +18,11 @@ import pytest
 from numpy.typing import NDArray
 
 from gym_mara.envs import MaraEnv
+from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.rendering.drawing import drawing_thread
 from gym_mara.rendering.renderer import NoDisplayError
 from gym_mara.testing import COPIES
-from tests.helpers import TARGET_Q, joint_xml, urdf_xml, write
+from tests.helpers import TARGET_Q, joint_xml, robot_model, urdf_xml, write
 
 SMALL: dict[str, Any] = {"width": 160, "height": 120}
 # Newer versions of Python warn of a fork in a process with threads.
@@ -134,6 +136,14 @@ def test_a_forked_process_cannot_use_the_opengl_of_its_parent() -> None:
 def draw_in_vtk() -> None:
     """Draw a picture in a new environment."""
     draw(drawable("vtk"))
+
+
+def test_pictures_are_freed_also_during_the_first_import_of_the_drawing_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module = ModuleType("gym_mara.rendering.drawing")  # as it is before its first line
+    monkeypatch.setitem(sys.modules, "gym_mara.rendering.drawing", module)
+    Pictures(robot_model("mara"), RenderSettings()).close()
 
 
 def test_environments_that_are_dropped_without_close_leave_no_renderer(
