@@ -164,7 +164,7 @@ def test_the_steps_that_were_trained_are_printed_if_they_are_more(
 def test_an_interrupt_before_there_is_a_run_says_that_nothing_is_saved(
     gym_mara: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*arguments: object) -> None:
+    def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gym_mara.agents.training.train.train", interrupted)
