@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
+
+from packaging.version import Version
 
 from gym_mara.robot.catalog import own_robots
 
@@ -38,3 +41,12 @@ def test_the_citation_names_the_package_as_it_is() -> None:
         assert line.format(value) in citation.splitlines()
     [author] = re.findall(r'authors = \[\{ name = "(.*)" \}\]', about)
     assert f"  - name: {author}" in citation.splitlines()
+
+
+def test_every_library_has_a_lowest_version_that_is_not_above_the_installed_one() -> None:
+    rows = runpy.run_path(str(ROOT / "benchmarks" / "versions.py"))["rows"]
+    table = {name: (lowest, installed) for name, _, lowest, installed in rows()}
+    assert {"numpy", "gymnasium", "torch", "stable-baselines3"} <= table.keys()
+    assert not [name for name, (lowest, _) in table.items() if lowest == "-"]
+    found = {name: each for name, each in table.items() if each[1] != "-"}
+    assert [name for name, (low, now) in found.items() if Version(now) < Version(low)] == []
