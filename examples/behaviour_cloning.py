@@ -3,7 +3,7 @@
 The data set is that of gym-mara record, with observations that are arrays. Without one, episodes of inverse kinematics on
 MARAReach-v0 are recorded first.
 
-    python examples/behaviour_cloning.py --data data/reach-v0
+    python examples/behaviour_cloning.py --data reach-v0
 """
 
 from __future__ import annotations

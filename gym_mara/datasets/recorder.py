@@ -52,7 +52,7 @@ def recorder(
     write, recorded = writer_class(form), Recorded()
     with folder_written_aside(folder) as aside:
         with writing(folder):
-            writer: Writer = write(aside, folder.name, contents)
+            writer: Writer = write(aside.absolute(), folder.name, contents)
         with closing(writer):
 
             def add(episode: Episode) -> None:

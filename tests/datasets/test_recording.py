@@ -202,6 +202,17 @@ def test_a_folder_that_appears_meanwhile_is_kept(
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
+@pytest.mark.parametrize("form", ["minari", "lerobot"])
+def test_the_folder_may_be_a_relative_path(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gym_mara: Cli
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--env", "MARA-v0", "--set", "max_joint_velocity=1.5", "--format", form]
+    code, _, err = gym_mara("record", "--policy", "ik", "--episodes", 1, "--out", "new-v0", *options)
+    assert code == 0, err
+    assert [path.name for path in tmp_path.iterdir()] == ["new-v0"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
