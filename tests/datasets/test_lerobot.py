@@ -22,10 +22,11 @@ from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS
 from tests.helpers import Cli
 
-# The libraries that read films leave pipes open.
+# imageio leaves the pipes of the FFmpeg from which it has read a film to the garbage collector.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
+
 LENGTH = 4
 OPTIONS = {"max_joint_velocity": 1.5}
 COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")

@@ -208,7 +208,9 @@ def test_the_folder_may_be_a_relative_path(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     options = ["--env", "MARA-v0", "--set", "max_joint_velocity=1.5", "--format", form]
-    code, _, err = gym_mara("record", "--policy", "ik", "--episodes", 1, "--out", "new-v0", *options)
+    code, _, err = gym_mara(
+        "record", "--policy", "ik", "--episodes", 1, "--out", "new-v0", *options
+    )
     assert code == 0, err
     assert [path.name for path in tmp_path.iterdir()] == ["new-v0"]
 
