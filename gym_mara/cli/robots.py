@@ -177,8 +177,8 @@ def _draw(arm: RobotModel, target: dict[str, Any], file: Path) -> None:
         with needs("pictures", "render", "imageio"):
             import imageio.v2 as imageio
 
-        pictures = Pictures(arm, RenderSettings(width=1280, height=960))
         view = View(arm.home, np.array(target["position"]), np.array(target["quaternion"]))
+        pictures = Pictures(arm, RenderSettings(width=1280, height=960), view)
         imageio.imwrite(temporary, pictures.of(view))
         pictures.close()
     err.print(str(file), soft_wrap=True)

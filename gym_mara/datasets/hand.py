@@ -20,6 +20,7 @@ from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.travel import VELOCITY_LIMIT, travel_velocity
+from gym_mara.envs.view import first_view
 from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.robot.inverse_kinematics import solve_ik
 from gym_mara.types import Floats
@@ -180,7 +181,10 @@ def record_by_hand(
     with closing(arms):
         simulation = arms.simulation
         contents = contents_of(simulation, env, {"backend": backend, **options}, NAME, pixels)
-        pictures = Pictures(simulation.robot, contents.pictures) if contents.pictures else None
+        pictures: Pictures | None = None
+        if contents.pictures:
+            first = first_view(simulation)
+            pictures = Pictures(simulation.robot, contents.pictures, first)
         simulation.streams = (Streams.seeded(seed),)
         with recorder(form, folder, contents) as (add, recorded):
             viewer = HandViewer(simulation, simulation.options.rendering)

@@ -16,6 +16,7 @@ from gym_mara.datasets.formats import writer_class
 from gym_mara.datasets.recorder import MOST_EPISODES, Recorded, recorder
 from gym_mara.datasets.sources import Source
 from gym_mara.envs import MaraVectorEnv
+from gym_mara.envs.view import first_view
 from gym_mara.errors import whole_number
 from gym_mara.registration import environment
 from gym_mara.rendering import Pictures
@@ -75,7 +76,10 @@ def record(
     with closing(arms):
         keywords = {"backend": source.backend, **source.keywords}
         contents = contents_of(arms.simulation, source.env, keywords, source.policy, pixels)
-        pictures = Pictures(arms.simulation.robot, contents.pictures) if contents.pictures else None
+        pictures: Pictures | None = None
+        if contents.pictures:
+            at_home = first_view(arms.simulation)
+            pictures = Pictures(arms.simulation.robot, contents.pictures, at_home)
         with recorder(form, folder, contents) as (add, recorded):
             for first in range(0, count, arms.num_envs):
                 seeds = recording_seeds(seed, first, arms.num_envs)

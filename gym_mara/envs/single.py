@@ -16,7 +16,7 @@ from gym_mara.envs.options import Options, check_reset_options
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.time_limits import TimeLimits
-from gym_mara.envs.view import view_of
+from gym_mara.envs.view import first_view, view_of
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
@@ -69,7 +69,9 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
             raise GymMaraError(
                 "an environment of one arm has NumPy's arrays: leave out arrays, or make a vector environment with make_vec"
             )
-        self._pictures = Pictures(self.simulation.robot, self._options.rendering)
+        self._pictures = Pictures(
+            self.simulation.robot, self._options.rendering, first_view(self.simulation)
+        )
         self.viewer: Viewer | None = None
         self._time_limits = TimeLimits()
         # The generator from which the simulation's streams were spawned.

@@ -19,7 +19,7 @@ from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
-from gym_mara.envs.view import view_of
+from gym_mara.envs.view import first_view, view_of
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
@@ -83,7 +83,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             "render_fps": 1.0 / self.simulation.backend.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
-        self._pictures = Pictures(self.simulation.robot, sorted_options.rendering)
+        self._pictures = Pictures(
+            self.simulation.robot, sorted_options.rendering, first_view(self.simulation)
+        )
         self._ended = self.simulation.backend.asarray(np.zeros(self.num_envs, dtype=np.bool_))
         # A copy of the last observations (N, O), which a reset with a mask returns for the other arms.
         self._last: Floats | None = None

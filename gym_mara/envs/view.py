@@ -7,6 +7,12 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.rendering.view import View
 
 
+def first_view(simulation: Simulation) -> View:
+    """The View of the arm in its home pose, with the target before the first episode: the same in all environments alike."""
+    goal = simulation.episodes.first_goal
+    return View(simulation.robot.home, goal.position[0], goal.quaternion[0])
+
+
 def view_of(simulation: Simulation, arm: int) -> View:
     """The View of an arm in the state of its last observation: after a collision, it shows the colliding state."""
     state, goal = simulation.observed(arm), simulation.goal

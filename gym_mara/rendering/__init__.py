@@ -5,7 +5,6 @@ Graphics libraries are imported when the first picture is drawn.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import sys
@@ -72,10 +71,11 @@ class Pictures:
     Args:
         robot: the arm.
         settings: the renderer, and the size and the camera of its pictures.
+        first: the view that is used to place a named camera, whatever is drawn.
     """
 
-    def __init__(self, robot: RobotModel, settings: RenderSettings) -> None:
-        self._robot, self._settings = robot, settings
+    def __init__(self, robot: RobotModel, settings: RenderSettings, first: View) -> None:
+        self._robot, self._settings, self._first = robot, settings, first
         self._key = next(_KEYS)
         weakref.finalize(self, _free, self._key, wait=False).atexit = False
 
@@ -88,8 +88,7 @@ class Pictures:
         """
         from gym_mara.rendering.drawing import drawing_thread
 
-        at_home = dataclasses.replace(view, q=self._robot.home)
-        make = functools.partial(make_renderer, self._robot, self._settings, at_home)
+        make = functools.partial(make_renderer, self._robot, self._settings, self._first)
         return drawing_thread().draw(self._key, make, view)
 
     def close(self) -> None:
@@ -97,7 +96,7 @@ class Pictures:
         _free(self._key, wait=True)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Pictures, (self._robot, self._settings)
+        return Pictures, (self._robot, self._settings, self._first)
 
 
 def _free(key: int, *, wait: bool) -> None:

@@ -89,6 +89,21 @@ def test_the_camera_of_an_environment_sees_the_home_pose_whatever_it_draws_first
     np.testing.assert_array_equal(placed_for.q, env.simulation.robot.home)
 
 
+def test_the_target_that_is_drawn_first_does_not_move_the_camera() -> None:
+    envs = [
+        MaraEnv("MARAReach-v0", render_mode="rgb_array", renderer="raycast", width=32, height=24)
+        for _ in range(2)
+    ]
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+        env.render()  # makes the renderer
+        env.reset(seed=2)
+    one, other = (env.render() for env in envs)
+    np.testing.assert_array_equal(one, other)
+    for env in envs:
+        env.close()
+
+
 def test_mara_fills_the_picture() -> None:
     scene, view = _scene("mara")
     seen = _in_picture(scene.points(view), place_camera(scene, view, RenderSettings()), 640, 480)

@@ -21,6 +21,7 @@ from gym_mara.envs import MaraEnv
 from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.rendering.drawing import drawing_thread
 from gym_mara.rendering.renderer import NoDisplayError
+from gym_mara.rendering.view import View
 from gym_mara.testing import COPIES
 from tests.helpers import TARGET_Q, joint_xml, robot_model, urdf_xml, write
 
@@ -143,7 +144,8 @@ def test_pictures_are_freed_also_during_the_first_import_of_the_drawing_thread(
 ) -> None:
     module = ModuleType("gym_mara.rendering.drawing")  # as it is before its first line
     monkeypatch.setitem(sys.modules, "gym_mara.rendering.drawing", module)
-    Pictures(robot_model("mara"), RenderSettings()).close()
+    first = View(np.zeros(6), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    Pictures(robot_model("mara"), RenderSettings(), first).close()
 
 
 def test_environments_that_are_dropped_without_close_leave_no_renderer(
