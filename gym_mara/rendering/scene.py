@@ -70,34 +70,48 @@ class Scene:
     def __init__(self, robot: RobotModel) -> None:
         self.robot = robot
         self._model, self._data = robot.model, robot.model.createData()
-        self._geometry, shapes = robot.visual
-        self._geometry_data = self._geometry.createData()
+        geometry, shapes = robot.visual
         parts: list[Part] = []
-        self._geometry_index: list[int] = []
-        for index, placed in enumerate(self._geometry.geometryObjects):
+        bodies: list[int] = []
+        placements: list[Floats] = []
+        for placed, shape in zip(geometry.geometryObjects, shapes, strict=True):
             link = str(self._model.frames[placed.parentFrame].name)
-            for mesh, colour in _meshes_of(placed, shapes[index]):
+            for mesh, colour in _meshes_of(placed, shape):
                 name = f"{placed.name}/{len(parts)}"
                 parts.append(_part(name, link, mesh, colour, fixed=placed.parentJoint == 0))
-                self._geometry_index.append(index)
-        self._num_bodies = len(parts)
+                bodies.append(placed.parentJoint)
+                placements.append(placed.placement.homogeneous)
         scale = _marker_scale(robot)
-        parts += _frame("target", 0.14 * scale, 0.006 * scale)
-        parts += _frame("tool", 0.09 * scale, 0.003 * scale)
+        tool = self._model.frames[robot.ee_frame_id]
+        for marker, body, placement in (
+            (_frame("target", 0.14 * scale, 0.006 * scale), self._model.njoints, np.eye(4)),
+            (
+                _frame("tool", 0.09 * scale, 0.003 * scale),
+                tool.parentJoint,
+                tool.placement.homogeneous,
+            ),
+        ):
+            parts += marker
+            bodies += [body] * len(marker)
+            placements += [placement] * len(marker)
         self.parts: tuple[Part, ...] = tuple(parts)
+        self.body_of_part: NDArray[np.int32] = np.array(bodies, np.int32)
+        """The rigid body of each part (P,): 0 for what is fixed, then the bodies of the joints, at last the target."""
+        self.on_body: Floats = np.array(placements)
+        """The pose of each part on its body, homogeneous matrices (P, 4, 4)."""
 
     def placements(self, view: View) -> Floats:
         """The pose of each part in the world frame, homogeneous matrices (P, 4, 4)."""
+        placed: Floats = self.bodies(view)[self.body_of_part] @ self.on_body
+        return placed
+
+    def bodies(self, view: View) -> Floats:
+        """The pose of each rigid body in the world frame, homogeneous matrices (B, 4, 4)."""
         pin.forwardKinematics(self._model, self._data, view.q)
-        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data)
-        tool = pin.updateFramePlacement(self._model, self._data, self.robot.ee_frame_id)
-        bodies = [placement.homogeneous for placement in self._geometry_data.oMg]
         target = np.eye(4)
         target[:3, :3] = pin.Quaternion(*view.target_quaternion).matrix()
         target[:3, 3] = view.target_position
-        frames = {"target": target, "tool": tool.homogeneous}
-        markers = [frames[part.link] for part in self.parts[self._num_bodies :]]
-        return np.array([bodies[index] for index in self._geometry_index] + markers)
+        return np.array([*(placement.homogeneous for placement in self._data.oMi), target])
 
     def colours(self, view: View) -> list[Colour]:
         """The colour of each part; links that collide are red."""
@@ -114,11 +128,9 @@ class Scene:
     def swept(self, q: Floats) -> Floats:
         """Where the arm is at configurations (N, J): the corners of boxes around its moving bodies (V, 3), m, in the world frame."""
         vertices: dict[int, list[NDArray[np.float32]]] = {}
-        for part, index in zip(self.parts, self._geometry_index, strict=False):
-            placed = self._geometry.geometryObjects[index]
-            if not part.fixed:
-                own = part.placed(placed.placement.homogeneous)
-                vertices.setdefault(placed.parentJoint - 1, []).append(own)
+        for part, body, placement in zip(self.parts, self.body_of_part, self.on_body, strict=True):
+            if not part.fixed and not part.marker:
+                vertices.setdefault(int(body) - 1, []).append(part.placed(placement))
         if not vertices:
             return np.empty((0, 3))
         bodies = sorted(vertices, reverse=True)
