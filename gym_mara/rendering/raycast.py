@@ -1,213 +1,234 @@
-"""The renderer "raycast": ray casting on the CPU with Embree, for machines without OpenGL.
+"""Ray casting on the CPU with Embree: the renderer "raycast", for machines without OpenGL, and pictures of many arms at once.
 
-trimesh also casts rays with Embree, but does not return where in a triangle a ray hits, which smooth shading needs. Through its
-interface the first hits of a picture took 200 ms with their positions, through Embree's own 18 ms.
+What does not move is drawn once for each camera and light, and kept (`_Background`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.extras import needs
-from gym_mara.rendering.camera import (
-    AMBIENT,
-    BACKGROUND,
-    FILL,
-    KEY,
-    SHADOW,
-    SPECULAR,
-    TO_KEY_LIGHT,
-    VIEW_ANGLE,
-    Camera,
-    floor_colour,
-)
+from gym_mara.rendering.camera import Camera
+from gym_mara.rendering.looks import Looks
+from gym_mara.rendering.rays import Float32s, Hits, Indices, Int32s
 from gym_mara.rendering.renderer import Picture, Renderer
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
+from gym_mara.rendering.shading import NOTHING, Photo, Seen, Surfaces, inside
 from gym_mara.rendering.view import View
-
-with needs("the renderer 'raycast'", "render", "embreex"):
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-Float32s = NDArray[np.float32]
-Int32s = NDArray[np.int32]
+from gym_mara.types import Floats, Mask
 
 _EDGE_OFFSETS = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]], np.float32)
 """Offsets from a pixel's centre of the rays through a pixel at an edge, pixels."""
-_SURFACE_OFFSET = 1e-3
-"""The distance from a surface at which the rays to the key light begin, m."""
 _EDGE_COSINE = 0.9
 """Neighbouring normals whose cosine is less than this form an edge."""
-_UPWARDS = np.array([0.0, 0.0, 1.0], np.float32)
-_FLOOR, _NOTHING = -1, -2
-"""The part indices of rays that hit the floor, or nothing."""
 
 
-class _Hits(NamedTuple):
-    """The hits of R rays."""
+class Drawn(NamedTuple):
+    """N pictures of height H and width W."""
 
-    colour: Float32s
-    """RGB in [0, 1] (R, 3)."""
+    colour: NDArray[np.uint8]
+    """RGB (N, H, W, 3)."""
+    depth: Float32s
+    """How far what is seen is from the camera along its axis (N, H, W), m; infinite for the background."""
     part: Int32s
-    """The index of the part, or _FLOOR, or _NOTHING (R,)."""
-    normal: Float32s
-    """The surface normal, towards the camera (R, 3); zero if no part was hit."""
-    lit: NDArray[np.bool_]
-    """Whether the key light reaches the point (R,)."""
+    """The index of the part (N, H, W), or FLOOR_PART, or NOTHING."""
 
 
-class _WorldMesh(NamedTuple):
-    """The parts of a view as one mesh in the world frame."""
+class _Background(NamedTuple):
+    """What does not move in pictures of H · W pixels, for each of U looks; all arrays are (U · H · W, …)."""
 
-    scene: EmbreeScene
-    normals: Float32s
-    """The normals of all vertices (V, 3)."""
-    colours: Float32s
-    """The colours of the parts (P, 3)."""
+    seen: Seen
+    lit: Mask
+    """Whether nothing fixed is between the point and the key light."""
+    point: Float32s
+    """What is seen, in the world, m."""
+    across_light: Float32s
+    """The point in the plane across the key light, m."""
+
+
+class Caster:
+    """Casts one ray through each pixel, four through each pixel at an edge, and from each hit one to the key light.
+
+    Args:
+        scene: the parts to draw.
+        camera: it has the floor.
+        width: of a picture, pixels.
+        height: of a picture, pixels.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, width: int, height: int) -> None:
+        self._surfaces = Surfaces(scene, camera)
+        bodies = self._surfaces.bodies.all
+        self._fixed = [body for body in bodies if body.number == 0]
+        self._moving = [body for body in bodies if body.number > 0]
+        self._fixed_parts = np.flatnonzero(scene.body_of_part == 0)
+        self._width, self._height = width, height
+        columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        self._points = (pixels - (np.array([width, height]) - 1.0) / 2.0).astype(np.float32)
+        self._known: list[bytes] = []
+        self._background: _Background | None = None
+
+    def draw(self, poses: Floats, looks: Looks) -> Drawn:
+        """Draw N arms.
+
+        Args:
+            poses: of the bodies of each arm (N, B, 4, 4).
+            looks: the N cameras, lights and colours.
+        """
+        size, shape = len(self._points), (len(poses), self._height, self._width)
+        behind, row = self._behind(poses, looks)
+        # Of each pixel of the N pictures, its place in the background.
+        place = (row[:, None] * size + np.arange(size)).ravel()
+        seen, lit = behind.seen.of(place), behind.lit[place]
+        moving = Photo(self._surfaces, self._moving, poses, looks, self._height)
+        photo = Photo(self._surfaces, self._fixed + self._moving, poses, looks, self._height)
+        changed = np.zeros(len(place), bool)
+        moved = self._add_moving(moving, seen)
+        changed[moved] = True
+        arm, pixel = np.divmod(moved, size)
+        points = photo.rays(arm, self._points[pixel]).at(seen.depth[moved])
+        lit[moved] = photo.lit(points, arm, seen.normal[moved])
+        shadow = self._shadow(moving, behind, place, np.flatnonzero(lit & ~changed))
+        lit[shadow], changed[shadow] = False, True
+        colour = seen.colour(lit)
+        edges = _edges(seen, lit, changed, shape)
+        if len(edges):
+            colour[edges] = self._finer(photo, *np.divmod(edges, size))
+        picture = np.uint8(255.0 * np.clip(colour, 0.0, 1.0) + 0.5)
+        return Drawn(
+            picture.reshape(*shape, 3), seen.depth.reshape(shape), seen.part.reshape(shape)
+        )
+
+    def _behind(self, poses: Floats, looks: Looks) -> tuple[_Background, Indices]:
+        """What does not move, for each different look, and which look each of the N arms has (N,)."""
+        own = looks._replace(colours=looks.colours[:, self._fixed_parts])
+        keys = [b"".join(values[i].tobytes() for values in own) for i in range(len(poses))]
+        new = list(dict.fromkeys(key for key in keys if key not in self._known))
+        if new or self._background is None:
+            first = [keys.index(key) for key in new]
+            drawn = self._draw_fixed(poses[first], looks.of(first))
+            kept = [i for i, key in enumerate(self._known) if key in keys]
+            if self._background is not None and kept:
+                drawn = _joined(_rows(self._background, kept, len(self._known)), drawn)
+            self._known = [*(self._known[i] for i in kept), *new]
+            self._background = drawn
+        return self._background, np.array([self._known.index(key) for key in keys])
+
+    def _draw_fixed(self, poses: Floats, looks: Looks) -> _Background:
+        photo = Photo(self._surfaces, self._fixed, poses, looks, self._height)
+        arm = np.repeat(np.arange(len(poses)), len(self._points))
+        rays, seen = photo.see(arm, np.tile(self._points, (len(poses), 1)))
+        points = rays.at(np.where(seen.part == NOTHING, np.float32(0.0), seen.depth))
+        lit = photo.lit(points, arm, seen.normal) | (seen.part == NOTHING)
+        everywhere = np.ones(len(arm), bool)
+        edges = _edges(seen, lit, everywhere, (len(poses), self._height, self._width))
+        if len(edges):
+            fine = self._finer(photo, *np.divmod(edges, len(self._points)))
+            # Where a shadow falls on an edge later, its pixel is drawn again.
+            seen.bright[edges] = seen.dark[edges] = fine
+        return _Background(seen, lit, points, photo.across_light(points, arm))
+
+    def _add_moving(self, moving: Photo, seen: Seen) -> Indices:
+        """Enter the moving bodies in what is seen, and return the pixels where they are, as indices of all pictures."""
+        size = len(self._points)
+        chosen = [self._within(box) for box in moving.in_picture.swapaxes(0, 1)]
+        near = np.zeros(len(seen.part), bool)
+        for pixels in chosen:
+            near[pixels] = True
+        all_near = np.flatnonzero(near)
+        number = np.cumsum(near) - 1
+        arm, pixel = np.divmod(all_near, size)
+        rays = moving.rays(arm, self._points[pixel])
+        hits = Hits.none(len(all_near))
+        hits.distance[:] = seen.depth[all_near]
+        for body, pixels in zip(moving.bodies, chosen, strict=True):
+            moving.cast(body, rays, number[pixels], hits)
+        hit = np.flatnonzero(hits.face >= 0)
+        new = moving.shade(rays.of(hit), hits.of(hit))
+        for values, own in zip(seen, new, strict=True):
+            values[all_near[hit]] = own
+        return all_near[hit]
+
+    def _within(self, box: Floats) -> Indices:
+        """The pixels of all pictures, as indices, within a rectangle of each picture (N, 2, 2)."""
+        size = np.array([self._width, self._height])
+        box = np.clip(box + (size - 1.0) / 2.0, -1.0, size)
+        low = np.clip(np.ceil(box[:, 0]), 0, size).astype(np.int64)
+        extent = np.maximum(np.clip(np.floor(box[:, 1]) + 1, 0, size).astype(np.int64) - low, 0)
+        count = extent.prod(axis=1)
+        number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        row, column = np.divmod(number, np.repeat(extent[:, 0], count))
+        corner = np.arange(len(box)) * size.prod() + low[:, 1] * self._width + low[:, 0]
+        return np.repeat(corner, count) + row * self._width + column
+
+    def _shadow(
+        self, moving: Photo, behind: _Background, place: Indices, pixels: Indices
+    ) -> Indices:
+        """Those of the pixels, which show something fixed in the light, that are in the shadow of a moving body."""
+        box = moving.in_light
+        around = np.stack([box[:, :, 0].min(axis=1), box[:, :, 1].max(axis=1)], axis=1)
+        arm = pixels // len(self._points)
+        flat = behind.across_light[place[pixels]]
+        near = inside(flat, around[arm]) & (behind.seen.part[place[pixels]] != NOTHING)
+        pixels, arm = pixels[near], arm[near]
+        points, normal = behind.point[place[pixels]], behind.seen.normal[place[pixels]]
+        return pixels[~moving.lit(points, arm, normal)]
+
+    def _finer(self, photo: Photo, arm: Indices, pixel: Indices) -> Float32s:
+        """RGB of pixels at edges (R, 3): the means of four rays each."""
+        count = len(_EDGE_OFFSETS)
+        points = np.concatenate([self._points[pixel] + offset for offset in _EDGE_OFFSETS])
+        rays, seen = photo.see(np.tile(arm, count), points)
+        solid = np.flatnonzero(seen.part != NOTHING)
+        lit = np.ones(len(points), bool)
+        at = rays.of(solid)
+        lit[solid] = photo.lit(at.at(seen.depth[solid]), at.arm, seen.normal[solid])
+        return seen.colour(lit).reshape(count, -1, 3).mean(axis=0)
 
 
 class RaycastRenderer(Renderer):
-    """Casts one ray through each pixel, four through each pixel at an edge, and from each hit one to the key light."""
+    """Ray casting of one picture."""
 
     def __init__(self, scene: Scene, camera: Camera, settings: RenderSettings, first: View) -> None:
         super().__init__(scene, camera, settings, first)
-        forwards = camera.at - camera.eye
-        forwards /= np.linalg.norm(forwards)
-        right = np.cross(forwards, camera.up)
-        right /= np.linalg.norm(right)
-        size = np.tan(np.radians(VIEW_ANGLE / 2.0)) / (self.height / 2.0)
-        self._axes = np.array([size * right, size * np.cross(right, forwards), forwards])
-        columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        self._pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float32)
-        self._rays = self._directions(self._pixels)
-        parts = scene.parts
-        self._part_of_face = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-        offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-        self._faces = np.concatenate(
-            [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
-        ).astype(np.int32)
-        # The reflection coefficients of each part.
-        marker = np.array([part.marker for part in parts])
-        self._ambient = np.where(marker, 0.8, AMBIENT).astype(np.float32)
-        self._diffuse = np.where(marker, 0.2, 1.0).astype(np.float32)
-        self._specular = np.where(marker, 0.0, SPECULAR).astype(np.float32)
-
-    def _directions(self, pixels: Float32s) -> Float32s:
-        """The directions (R, 3) of the rays through points of the picture (R, 2), given as column and row."""
-        centre = np.array([self.width - 1, self.height - 1]) / 2.0
-        across, down = (pixels - centre).T
-        rays = np.stack([across, -down, np.ones(len(pixels))], axis=1) @ self._axes
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), np.float32)
+        self._caster = Caster(scene, camera, self.width, self.height)
 
     def render(self, view: View) -> Picture:
-        world = self._world_mesh(view)
-        hits = self._cast(self._rays, world)
-        colour = hits.colour
-        edges = self._edges(hits)
-        if edges.any():
-            points = self._pixels[edges]
-            rays = self._directions(np.concatenate([points + offset for offset in _EDGE_OFFSETS]))
-            finer = self._cast(rays, world).colour
-            colour[edges] = finer.reshape(len(_EDGE_OFFSETS), -1, 3).mean(axis=0)
-        picture = np.uint8(255.0 * np.clip(colour, 0.0, 1.0) + 0.5)
-        return picture.reshape(self.height, self.width, 3)
+        looks = Looks.usual(self.camera, np.array([self.scene.colours(view)]))
+        return self._caster.draw(self.scene.bodies(view)[None], looks).colour[0]
 
-    def _world_mesh(self, view: View) -> _WorldMesh:
-        vertices, normals = [], []
-        for part, placement in zip(self.scene.parts, self.scene.placements(view), strict=True):
-            vertices.append(part.placed(placement))
-            normals.append(part.normals @ placement[:3, :3].T.astype(np.float32))
-        scene = EmbreeScene()
-        TriangleMesh(scene, np.concatenate(vertices), self._faces)
-        colours = np.array(self.scene.colours(view), np.float32)
-        return _WorldMesh(scene, np.concatenate(normals), colours)
 
-    def _cast(self, rays: Float32s, world: _WorldMesh) -> _Hits:
-        """Cast rays (R, 3) from the camera, and light the points that they hit."""
-        eye = self.camera.eye.astype(np.float32)
-        found = world.scene.run(np.tile(eye, (len(rays), 1)), rays, query="INTERSECT", output=1)
-        face, distance = found["primID"], found["tfar"]
-        part = np.where(face >= 0, self._part_of_face[face], _NOTHING).astype(np.int32)
-        with np.errstate(divide="ignore"):
-            to_floor = (self.camera.floor[2] - eye[2]) / rays[:, 2]
-        part[(to_floor > 0.0) & (to_floor < distance)] = _FLOOR
-        hits = _Hits(
-            colour=np.tile(np.array(BACKGROUND, np.float32), (len(rays), 1)),
-            part=part,
-            normal=np.zeros_like(rays),
-            lit=np.ones(len(rays), np.bool_),
-        )
-        on_floor = np.flatnonzero(part == _FLOOR)
-        points = eye + to_floor[on_floor, None] * rays[on_floor]
-        distance_from_middle = np.linalg.norm(points[:, :2] - self.camera.floor[:2], axis=1)
-        hits.lit[on_floor] = self._is_lit(points, _UPWARDS, world)
-        floor = floor_colour(distance_from_middle / self.camera.floor_radius)
-        hits.colour[on_floor] = floor * np.where(hits.lit[on_floor], 1.0, SHADOW)[:, None]
-        on_part = np.flatnonzero(part >= 0)
-        points = eye + distance[on_part, None] * rays[on_part]
-        barycentric = found["u"][on_part, None], found["v"][on_part, None]
-        self._shade(hits, on_part, points, rays[on_part], barycentric, face[on_part], world)
-        return hits
+def _rows(background: _Background, kept: list[int], count: int) -> _Background:
+    """The background of some of `count` looks."""
 
-    def _shade(
-        self,
-        hits: _Hits,
-        on_part: NDArray[np.int64],
-        points: Float32s,
-        rays: Float32s,
-        barycentric: tuple[Float32s, Float32s],
-        faces: Int32s,
-        world: _WorldMesh,
-    ) -> None:
-        """Set the colour, normal and light of K rays that hit a part (Blinn-Phong reflection).
+    def of(values: Any) -> Any:
+        return values.reshape(count, -1, *values.shape[1:])[kept].reshape(-1, *values.shape[1:])
 
-        Args:
-            hits: the hits of all rays.
-            on_part: the indices of the K rays.
-            points: the points that they hit (K, 3), m.
-            rays: their directions (K, 3).
-            barycentric: the coordinates u and v of the points in their faces, each (K, 1).
-            faces: the indices of the faces (K,).
-            world: the mesh.
-        """
-        first, second, third = (world.normals[self._faces[faces, corner]] for corner in range(3))
-        u, v = barycentric
-        normal = (1.0 - u - v) * first + u * second + v * third
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        towards_eye = -np.vecdot(normal, rays)
-        normal *= np.where(towards_eye < 0.0, -1.0, 1.0)[:, None].astype(np.float32)
-        part = hits.part[on_part]
-        to_light = TO_KEY_LIGHT.astype(np.float32)
-        lit = self._is_lit(points, normal, world)
-        key = np.maximum(normal @ to_light, 0.0) * lit
-        light = KEY * key + FILL * np.abs(towards_eye)
-        half_vector = to_light - rays
-        half_vector /= np.linalg.norm(half_vector, axis=1, keepdims=True)
-        specular = np.maximum(np.vecdot(normal, half_vector), 0.0) ** 60 * lit
-        matt = world.colours[part] * (self._ambient[part] + self._diffuse[part] * light)[:, None]
-        hits.colour[on_part] = matt + (KEY * self._specular[part] * specular)[:, None]
-        hits.normal[on_part], hits.lit[on_part] = normal, lit
+    lit, point, across = (of(values) for values in background[1:])
+    return _Background(Seen._make(map(of, background.seen)), lit, point, across)
 
-    def _is_lit(self, points: Float32s, normal: Float32s, world: _WorldMesh) -> NDArray[np.bool_]:
-        """Whether the key light reaches points (K, 3) of surfaces with these normals, (K, 3) or (3,)."""
-        begin = np.asarray(points + _SURFACE_OFFSET * normal, np.float32)
-        to_light = np.tile(TO_KEY_LIGHT.astype(np.float32), (len(points), 1))
-        blocked = world.scene.run(begin, to_light, query="OCCLUDED")
-        return np.asarray(blocked < 0)
 
-    def _edges(self, hits: _Hits) -> NDArray[np.bool_]:
-        """The pixels (R,) that differ from a neighbour in the part, in the normal, or in being lit."""
-        shape = (self.height, self.width)
-        part, lit = hits.part.reshape(shape), hits.lit.reshape(shape)
-        normal = hits.normal.reshape(*shape, 3)
-        edges = np.zeros(shape, np.bool_)
-        for one, other in ((np.s_[1:, :], np.s_[:-1, :]), (np.s_[:, 1:], np.s_[:, :-1])):
-            bent = (part[one] >= 0) & (np.vecdot(normal[one], normal[other]) < _EDGE_COSINE)
-            differs = (part[one] != part[other]) | (lit[one] != lit[other]) | bent
-            edges[one] |= differs
-            edges[other] |= differs
-        return edges.ravel()
+def _joined(one: _Background, other: _Background) -> _Background:
+    """The background of all looks of two."""
+    seen = Seen._make(map(np.concatenate, zip(one.seen, other.seen, strict=True)))
+    lit, point, across = map(np.concatenate, zip(one[1:], other[1:], strict=True))
+    return _Background(seen, lit, point, across)
+
+
+def _edges(seen: Seen, lit: Mask, changed: Mask, shape: tuple[int, int, int]) -> Indices:
+    """The pixels, as indices, that differ from a neighbour in the part, in the normal, or in being lit, where one of both has changed."""
+    part, bright, new = (values.reshape(shape) for values in (seen.part, lit, changed))
+    normal = seen.normal.reshape(*shape, 3)
+    edges = np.zeros(shape, np.bool_)
+    for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
+        differs = (part[one] != part[other]) | (bright[one] != bright[other])
+        differs &= new[one] | new[other]
+        solid = (part[one] >= 0) & (part[other] >= 0) & new[one] & ~differs
+        differs[solid] = np.vecdot(normal[one][solid], normal[other][solid]) < _EDGE_COSINE
+        edges[one] |= differs
+        edges[other] |= differs
+    return np.flatnonzero(edges)
