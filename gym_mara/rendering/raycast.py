@@ -215,8 +215,12 @@ def _rows(background: _Background, kept: list[int], count: int) -> _Background:
 def _joined(one: _Background, other: _Background) -> _Background:
     """The background of all looks of two."""
     seen = Seen._make(map(np.concatenate, zip(one.seen, other.seen, strict=True)))
-    lit, point, across = map(np.concatenate, zip(one[1:], other[1:], strict=True))
-    return _Background(seen, lit, point, across)
+    return _Background(
+        seen,
+        np.concatenate([one.lit, other.lit]),
+        np.concatenate([one.point, other.point]),
+        np.concatenate([one.across_light, other.across_light]),
+    )
 
 
 def _edges(seen: Seen, lit: Mask, changed: Mask, shape: tuple[int, int, int]) -> Indices:
