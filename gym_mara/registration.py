@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from gymnasium.envs.registration import register
 
@@ -22,8 +23,8 @@ class Environment(NamedTuple):
     """The length of its episodes, steps."""
     goals: bool = False
     """Whether it is a goal environment: its classes are MaraGoalEnv and MaraGoalVectorEnv, else MaraEnv and MaraVectorEnv."""
-    backend: str | None = None
-    """Its usual backend; None for that of the package."""
+    keywords: Mapping[str, Any] = {}
+    """Its own keyword arguments, which a user may replace."""
 
 
 ENVIRONMENTS: dict[str, Environment] = {}
@@ -71,8 +72,12 @@ def register_environments() -> None:
     for name, task in list(TASKS.items()):
         register_task(name, task)
     _register("MARAGoal-v0", Environment("MARARandomTarget-v0", 50, goals=True), {})
-    real = Environment("MARA-v0", MAX_EPISODE_STEPS, backend="ros2")
-    _register("MARAReal-v0", real, {"task": "MARA-v0", "backend": "ros2"})
+    for name, keywords in (
+        ("MARAReal-v0", {"backend": "ros2"}),
+        ("MARACamera-v0", {"observation": "state+pixels"}),
+    ):
+        own = Environment("MARA-v0", MAX_EPISODE_STEPS, keywords=keywords)
+        _register(name, own, {"task": "MARA-v0", **keywords})
 
 
 def environment_id(name: str) -> str:

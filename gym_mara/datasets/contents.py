@@ -62,6 +62,10 @@ def contents_of(
     Raises:
         GymMaraError: the size of the pictures is out of its range.
     """
+    if simulation.pixels is not None:
+        raise GymMaraError(
+            f"give pixels (--pixels) to record pictures, and leave out observation={simulation.pixels.settings.observation!r}"
+        )
     space, kind = simulation.observation_space, interface(simulation)
     pictures: RenderSettings | None = None
     wrappers: tuple[WrapperSpec, ...] = ()

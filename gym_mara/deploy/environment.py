@@ -73,7 +73,7 @@ def _parts(simulation: Any) -> tuple[Part, ...]:
     """The parts of the observation, each in the entry of the dictionary that it belongs to, if there is one."""
     parts = simulation.observation.parts
     numbers = np.arange(sum(len(part.low) for part in parts))
-    groups = simulation.present(numbers)
+    groups = simulation.form(numbers)
     if not isinstance(groups, dict):
         groups = {OBSERVATION: numbers}
     starts = np.cumsum([0, *(len(part.low) for part in parts)])

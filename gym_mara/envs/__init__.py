@@ -45,7 +45,5 @@ def make_vector_env(name: str, num_envs: int, **options: Any) -> MaraVectorEnv:
     """
     made = environment(name)
     kind = MaraGoalVectorEnv if made.goals else MaraVectorEnv
-    defaults: dict[str, Any] = {"task": made.task, "max_episode_steps": made.max_episode_steps}
-    if made.backend is not None:
-        defaults["backend"] = made.backend
-    return kind(num_envs, **(defaults | options))
+    own = {"task": made.task, "max_episode_steps": made.max_episode_steps, **made.keywords}
+    return kind(num_envs, **(own | options))

@@ -85,9 +85,14 @@ class GoalSimulation(Simulation):
             box = Observation(parts, overshoot).space
             spaces[name], self._columns[name] = box, slice(start, start + box.shape[0])
             start += box.shape[0]
-        self.observation_space = Dict(spaces)
+        if self.pixels is not None and self.pixels.settings.observation != "state+pixels":
+            raise GymMaraError(
+                f"a goal environment observes its goals, so observation must be 'state' or 'state+pixels', not "
+                f"{self.pixels.settings.observation!r}"
+            )
+        self.form_space = Dict(spaces)
 
-    def present(self, flat: Floats) -> dict[str, Floats]:
+    def form(self, flat: Floats) -> dict[str, Floats]:
         """The groups of flat observations (…, O) by name."""
         return {name: contiguous(flat[..., own]) for name, own in self._columns.items()}
 

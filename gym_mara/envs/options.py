@@ -1,4 +1,4 @@
-"""Assigns the keyword arguments of an environment to the task, the backend, the actions, the sensors and the rendering."""
+"""Assigns the keyword arguments of an environment to the task, the backend, the actions, the sensors and the pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gym_mara.backends import backend_names, backend_settings
 from gym_mara.envs.actions import ActionSettings
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import GymMaraError, one_of, unknown
-from gym_mara.rendering import RenderSettings
+from gym_mara.rendering import PixelSettings, RenderSettings
 from gym_mara.robot import RobotLike, RobotModel, RobotOptions
 from gym_mara.tasks import Task, named_task
 
@@ -31,6 +31,7 @@ class Options:
     actions: ActionSettings
     sensors: SensorSettings
     rendering: RenderSettings
+    pixels: PixelSettings
 
     @classmethod
     def sort(
@@ -49,8 +50,8 @@ class Options:
             robot: a robot's name, the path of a URDF, a list of MARA's modules, or a RobotModel.
             ee_frame: the end-effector link of a URDF of your own.
             backend: the name of a backend.
-            keywords: values of the task and the robot, and settings of the backend, the actions, the sensors and the
-                rendering.
+            keywords: values of the task and the robot, and settings of the backend, the actions, the sensors, the rendering and
+                the pictures of observations.
             receiver: the class of the environment that received them, for the names in an error.
 
         Raises:
@@ -65,6 +66,7 @@ class Options:
             "actions": _names(ActionSettings),
             "sensors": _names(SensorSettings),
             "rendering": _names(RenderSettings),
+            "observation": _names(PixelSettings),
         }
         own: dict[str, dict[str, Any]] = {room: {} for room in rooms}
         for name, value in keywords.items():
@@ -85,6 +87,7 @@ class Options:
             actions=ActionSettings(**own["actions"]),
             sensors=SensorSettings(**own["sensors"]),
             rendering=RenderSettings(**own["rendering"]),
+            pixels=PixelSettings(**own["observation"]),
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
@@ -22,11 +22,15 @@ from gym_mara.envs.sensors import Sensors, check_noise, noise_of
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams, check_streams, parameter_seeds
 from gym_mara.errors import GymMaraError, whole_number
+from gym_mara.rendering.settings import JOINTS, STATE
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
-from gym_mara.tasks.observation import PACE, last_action
+from gym_mara.tasks.observation import OF_THE_ROBOT, PACE, last_action
 from gym_mara.types import Floats, Mask
+
+if TYPE_CHECKING:
+    from gym_mara.rendering.pixels import Pixels
 
 
 class Simulation:
@@ -91,10 +95,37 @@ class Simulation:
             asarray(self.robot.lower - overshoot),
             asarray(self.robot.upper + overshoot),
         )
-        self.observation_space: Space[Any] = self.observation.space
-        """The space of one arm's observation in the form of `present`."""
+        self.form_space: Space[Any] = self.observation.space
+        """The space of one arm's observation in the form of `form`, without pictures."""
+        # What is observed beside pictures, and its columns in flat observations; None for everything.
+        self._shown: tuple[Observation, NDArray[np.int64]] | None = None
+        if options.pixels.observation == JOINTS:
+            self._shown = self.observation.only(OF_THE_ROBOT)
+        self.pixels = self._new_pixels(options)
+        """Draws the pictures of observations; None without pictures."""
         # The range of joint targets (J,), rad (m).
         self.target_low, self.target_high = self.actions.target_low, self.actions.target_high
+
+    def _new_pixels(self, options: Options) -> Pixels | None:
+        settings = options.pixels
+        if settings.observation == STATE:
+            return None
+        if self._tensor is not None:
+            raise GymMaraError(
+                f"pictures are NumPy's arrays: leave out arrays={self.backend.arrays!r}, or observation={settings.observation!r}"
+            )
+        from gym_mara.envs.view import first_view
+        from gym_mara.rendering.pixels import Pixels  # it imports graphics libraries
+
+        return Pixels(settings, self.robot, self.num_envs, first_view(self))
+
+    @property
+    def observation_space(self) -> Space[Any]:
+        """The space of one arm's observation in the form of `present`."""
+        if self.pixels is None:
+            return self.form_space
+        own = self.form_space if self._shown is None else self._shown[0].space
+        return self.pixels.space(own)
 
     @property
     def goal(self) -> Goal:
@@ -104,7 +135,8 @@ class Simulation:
     @property
     def random(self) -> bool:
         """Whether episodes have random parameters or goals, so that `reset` needs `streams`."""
-        return self.backend.random or self.task.random_goal
+        pictures = self.pixels is not None and self.pixels.random
+        return self.backend.random or self.task.random_goal or pictures
 
     def reset(
         self, mask: Mask | None = None, given: Given | None = None
@@ -129,6 +161,9 @@ class Simulation:
         self.statistics.clear(chosen)
         self._started = True
         self._began[chosen] = True
+        if self.pixels is not None and self.pixels.random:
+            begun = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+            self.pixels.begin({arm: self.streams[arm].pixels for arm in begun.tolist()})
         state, q = self.backend.state, start
         noise = noise_of(state)
         if noise is not None:
@@ -215,9 +250,25 @@ class Simulation:
         """The rewards (N,) of a state with its observations (N, O), and their terms."""
         return self.task.reward(state, self.goal)
 
-    def present(self, flat: Floats) -> Any:
-        """Flat observations (…, O) in the form of the observation space."""
+    def form(self, flat: Floats) -> Any:
+        """Flat observations (…, O) in the form of `form_space`."""
         return flat
+
+    def present(self, flat: Floats, arms: NDArray[np.int64] | None = None) -> Any:
+        """Flat observations (n, O) in the form of the observation space.
+
+        Args:
+            flat: of some arms. If there are pictures, they are of the last observations of these arms.
+            arms: their indices (n,); None for all N arms.
+        """
+        if self.pixels is None:
+            return self.form(flat)
+        from gym_mara.envs.view import view_of
+
+        chosen = np.arange(self.num_envs) if arms is None else arms
+        views = [view_of(self, arm) for arm in chosen.tolist()]
+        own = self.form(flat) if self._shown is None else flat[:, self._shown[1]]
+        return self.pixels.present(own, views, chosen)
 
     def observed(self, arm: int) -> SimState:
         """The state of an arm's last observation: after a collision, the colliding state, even if the arm was reset."""
@@ -319,6 +370,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
+            "looks": None if self.pixels is None else self.pixels.seeds.copy(),
             **self.episodes.save(),
         }
 
@@ -348,6 +400,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": tuple,
             "started": bool,
+            "looks": type(None) if self.pixels is None else self.pixels.seeds,
             **self.episodes.save(),
         }
         check_fits("snapshot", snapshot, form | others)
@@ -371,6 +424,8 @@ class Simulation:
         self.actions.restore(snapshot["actions"])
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
+        if self.pixels is not None:
+            self.pixels.seeds = snapshot["looks"].copy()
         self.outcome = None
         self.episodes.restore(snapshot)
 

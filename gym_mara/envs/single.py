@@ -110,7 +110,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         observation, report = self.simulation.reset(given=given)
         if self.render_mode == "human":
             self._show()
-        return self.simulation.present(observation[0]), _info_of_one(report)
+        return self._first_of(observation), _info_of_one(report)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Execute an action (A,) for one control period.
@@ -126,8 +126,15 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         # At every step, because an environment does not know when Gymnasium's TimeLimit truncates its episode.
         info["statistics"] = self.simulation.statistics.of(0)
         terminated, truncated = outcome.terminated.item(), outcome.truncated is not None
-        observation = self.simulation.present(outcome.observation[0])
+        observation = self._first_of(outcome.observation)
         return observation, outcome.reward.item(), terminated, truncated, info
+
+    def _first_of(self, flat: Floats) -> Any:
+        """The observation of the only arm, of flat observations (1, O)."""
+        observation = self.simulation.present(flat)
+        if isinstance(observation, dict):
+            return {name: values[0] for name, values in observation.items()}
+        return observation[0]
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """Draw the state of the last observation: uint8 (height, width, 3), RGB; None without render_mode "rgb_array".

@@ -27,6 +27,8 @@ class Streams(NamedTuple):
     """Draws the sensors' noise."""
     backends: np.random.Generator
     """Seeds the physical parameters after a switch of the backend."""
+    pixels: np.random.Generator
+    """Seeds how the pictures of each episode look."""
 
     @classmethod
     def of(cls, generator: np.random.Generator) -> Streams:

@@ -247,8 +247,13 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             final = _vector_info({"": observation}, ended)
             return self.simulation.present(final[""])
         last = np.full(self.num_envs, None, dtype=object)
-        for index in np.flatnonzero(ended):
-            last[index] = self.simulation.present(observation[index].copy())
+        arms = np.flatnonzero(ended)
+        shown = self.simulation.present(observation[arms], arms)
+        for row, arm in enumerate(arms):
+            if isinstance(shown, dict):
+                last[arm] = {name: values[row] for name, values in shown.items()}
+            else:
+                last[arm] = shown[row]
         return last
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

@@ -12,7 +12,7 @@ import weakref
 from typing import TYPE_CHECKING, Any
 
 from gym_mara.errors import MissingExtraError
-from gym_mara.rendering.settings import CAMERAS, RENDERERS, RenderSettings
+from gym_mara.rendering.settings import CAMERAS, RENDERERS, PixelSettings, RenderSettings
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _KEYS = itertools.count()
 """Numbers the renderers of this process."""
 
-__all__ = ["CAMERAS", "RENDERERS", "Pictures", "RenderSettings", "make_renderer"]
+__all__ = ["CAMERAS", "RENDERERS", "Pictures", "PixelSettings", "RenderSettings", "make_renderer"]
 
 
 def make_renderer(robot: RobotModel, settings: RenderSettings, first: View) -> Renderer:

@@ -81,7 +81,8 @@ class Scene:
                 parts.append(_part(name, link, mesh, colour, fixed=placed.parentJoint == 0))
                 bodies.append(placed.parentJoint)
                 placements.append(placed.placement.homogeneous)
-        scale = _marker_scale(robot)
+        scale = self.marker_scale = _marker_scale(robot)
+        """The size of markers relative to those of MARA."""
         tool = self._model.frames[robot.ee_frame_id]
         for marker, body, placement in (
             (_frame("target", 0.14 * scale, 0.006 * scale), self._model.njoints, np.eye(4)),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from gymnasium.spaces import Box
+from numpy.typing import NDArray
 
 from gym_mara import rotations
 from gym_mara.arrays import Constants, namespace
@@ -53,6 +54,20 @@ _WAYS = Constants(0.3, 2.0)
 PACE = "pace"
 """The name of the part, in [0, 1], by which actions that are steps are multiplied, if an observation has it."""
 
+OF_THE_ROBOT = frozenset(
+    {
+        "joint_positions",
+        "joint_velocities",
+        "joint_cosines_and_sines",
+        "tool_position",
+        "tool_rotation",
+        "tool_quaternion",
+        "tool_velocity",
+        "last_action",
+    }
+)
+"""The names of the parts that a robot knows of itself, without the target and its surroundings."""
+
 
 class Observation:
     """Concatenates parts into one flat array.
@@ -75,7 +90,7 @@ class Observation:
                     f"the bounds of {part.name!r} must be two arrays of the same shape (K,), "
                     f"not {np.shape(part.low)} and {np.shape(part.high)}"
                 )
-        self.parts = tuple(parts)
+        self.parts, self._overshoot = tuple(parts), overshoot
         self._values = [part.values for part in parts]
         wider = [overshoot if part.joint_limits else 0.0 for part in parts]
         low = np.concatenate([part.low - by for part, by in zip(parts, wider, strict=True)])
@@ -96,6 +111,22 @@ class Observation:
             if part.name == name:
                 return slice(end - len(part.low), end)
         return None
+
+    def only(self, names: Collection[str]) -> tuple[Observation, NDArray[np.int64]]:
+        """The observation of the parts with these names alone, and its columns in flat observations (O,).
+
+        Raises:
+            GymMaraError: there is no such part.
+        """
+        chosen = [part for part in self.parts if part.name in names]
+        if not chosen:
+            own = ", ".join(part.name for part in self.parts)
+            raise GymMaraError(
+                f"the task observes nothing of {', '.join(sorted(names))}: it has {own}"
+            )
+        columns = np.arange(self._ends[-1])
+        places = [columns[self.place(part.name)] for part in chosen]
+        return Observation(chosen, self._overshoot), np.concatenate(places)
 
     def split(self, flat: Floats) -> dict[str, Floats]:
         """Split flat observations (…, O) into their parts by name: views of shape (…, K)."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Dict
+from gymnasium.spaces import Dict, Space
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -212,6 +212,11 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> BaseAlgorith
         raise GymMaraError(
             "a preset with normalise_observation needs observations that are arrays, not dictionaries"
         )
+    if any(len(space.shape or ()) == 3 for space in _boxes(env.observation_space)):
+        raise GymMaraError(
+            "the presets are made for states, not for pictures: leave out observation, or train with Stable-Baselines3 itself, as "
+            "examples/reach_from_pixels.py does"
+        )
     use_one_thread()
     wrapped = VecNormalize(
         env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
@@ -228,6 +233,11 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> BaseAlgorith
         if isinstance(error, GymMaraError):
             raise
         raise GymMaraError(f"{algo} does not take the preset's arguments: {error}") from error
+
+
+def _boxes(space: Space[Any]) -> list[Space[Any]]:
+    """The spaces in a dictionary of spaces, or the space itself."""
+    return list(space.values()) if isinstance(space, Dict) else [space]
 
 
 def use_one_thread() -> None:

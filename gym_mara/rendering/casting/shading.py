@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gym_mara.rendering.camera import SHADOW, SPECULAR, Camera
-from gym_mara.rendering.looks import Looks
-from gym_mara.rendering.rays import (
+from gym_mara.rendering.casting.looks import Looks
+from gym_mara.rendering.casting.rays import (
     Bodies,
     Body,
     Float32s,
@@ -116,7 +116,7 @@ class Photo:
         return Rays(arm, self._looks.eye[arm], turned(self._looks.axes[arm], ahead))
 
     def cast(self, body: Body, rays: Rays, chosen: Indices, hits: Hits) -> None:
-        """Cast some rays at a body, as `gym_mara.rendering.rays.cast`."""
+        """Cast some rays at a body, as `gym_mara.rendering.casting.rays.cast`."""
         cast(body, self._poses, rays, chosen, hits)
 
     def see(self, arm: Indices, points: Float32s) -> tuple[Rays, Seen]:
