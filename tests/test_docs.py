@@ -126,6 +126,17 @@ def test_the_scripts_of_the_page_on_training_run(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
+def test_every_breaking_change_since_the_first_version_has_a_note() -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("## [0.1.0]")[0]
+    notes, counted = 0, False
+    for line in (ROOT / "docs" / "upgrade.md").read_text(encoding="utf-8").splitlines():
+        counted = line.startswith("| change | what you see | now |") or (
+            counted and line.startswith("|")
+        )
+        notes += counted and not line.startswith(("| change", "|---"))
+    assert notes == changes.count("**Breaking:**") > 0
+
+
 def _links(page: Path) -> list[tuple[str, Path, str]]:
     """The relative links of a page: as written, the file, and the anchor ("" without one)."""
     links = []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from packaging.version import Version
 
+import gym_mara
 from gym_mara.robot.catalog import own_robots
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,6 +40,8 @@ def test_the_citation_names_the_package_as_it_is() -> None:
     }.items():
         value = re.findall(f'^{field} = "(.*)"$', about, re.M)[0]
         assert line.format(value) in citation.splitlines()
+    assert f"version: {gym_mara.__version__}" in citation.splitlines()
+    assert f'version = "{gym_mara.__version__}"' in about.splitlines()
     [author] = re.findall(r'authors = \[\{ name = "(.*)" \}\]', about)
     assert f"  - name: {author}" in citation.splitlines()
 

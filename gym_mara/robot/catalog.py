@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pinocchio
 
@@ -14,11 +14,15 @@ from gym_mara.files import read_text
 
 
 class RobotFiles(NamedTuple):
-    """A robot's URDF, its SRDF if it has one, and its end-effector frame unless the SRDF names it."""
+    """What a robot is read from."""
 
     urdf: Path
     srdf: Path | None = None
+    """None if the robot has none."""
     ee_frame: str | None = None
+    """The end-effector frame; None for the one that the SRDF names."""
+    without: tuple[str, ...] = ()
+    """The links of the URDF that are left out, each with the joint that carries it; nothing may be attached to them."""
 
 
 def _robots_dir() -> Path:
@@ -31,6 +35,16 @@ def own_robots() -> dict[str, RobotFiles]:
         urdf.stem: RobotFiles(urdf, urdf.with_suffix(".srdf"))
         for urdf in sorted(_robots_dir().glob("*/*.urdf"))
         if urdf.stem == urdf.parent.name
+    }
+
+
+def _variants() -> dict[str, RobotFiles]:
+    """The robots that are one of gym_mara's own without some of its links."""
+    listed: dict[str, dict[str, Any]] = json.loads(read_text(_robots_dir() / "variants.json"))
+    own = own_robots()
+    return {
+        name: own[entry["of"]]._replace(without=tuple(entry["without"]))
+        for name, entry in listed.items()
     }
 
 
@@ -53,7 +67,7 @@ def _example_arms() -> dict[str, dict[str, str | None]]:
 
 def robot_names() -> list[str]:
     """Every name that `find` accepts; the robots that gym_mara ships come first."""
-    return [*own_robots(), *_example_arms()]
+    return [*own_robots(), *_variants(), *_example_arms()]
 
 
 def find(name: str) -> RobotFiles:
@@ -63,7 +77,7 @@ def find(name: str) -> RobotFiles:
         GymMaraError: no robot has this name.
         MissingExtraError: the robot comes with example-robot-data, which is not installed.
     """
-    own = own_robots()
+    own = own_robots() | _variants()
     if name in own:
         return own[name]
     arm = _example_arms().get(name)

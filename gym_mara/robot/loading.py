@@ -20,7 +20,7 @@ from gym_mara.robot.description.off_chain import keep_chain
 from gym_mara.robot.description.srdf import Semantics, read_srdf
 from gym_mara.robot.description.target import Target, read_target
 from gym_mara.robot.description.urdf import build, ee_frame_among_links, find_chain
-from gym_mara.robot.description.xml_files import read_xml
+from gym_mara.robot.description.xml_files import read_xml, remove_links
 from gym_mara.robot.diagnosis import (
     Finding,
     body_findings,
@@ -43,9 +43,7 @@ Findings = Sequence[Finding]
 
 def from_files(
     cls: type[RobotModel],
-    urdf: Path,
-    ee_frame: str | None,
-    srdf: Path | None,
+    files: catalog.RobotFiles,
     name: str | None,
     options: RobotOptions,
     findings: Findings | None = None,
@@ -54,9 +52,7 @@ def from_files(
 
     Args:
         cls: RobotModel.
-        urdf: its file.
-        ee_frame: the end-effector link; None for the SRDF's.
-        srdf: its file; None for none.
+        files: what it is read from.
         name: the robot's name; None for the URDF's.
         options: what is added to the files.
         findings: those of an arm of which a copy is made; None to look for them.
@@ -64,14 +60,16 @@ def from_files(
     Raises:
         GymMaraError: a file is missing or broken, or describes no fixed-base arm.
     """
+    urdf, srdf, ee_frame, without = files
     root = read_xml(urdf, "URDF")
     of_files = check_urdf(urdf, root, options.package_dirs)
     semantics = read_srdf(srdf) if srdf else Semantics()
+    semantics = semantics.without(remove_links(root, without))
     ee_frame = ee_frame_among_links(urdf, root, ee_frame or semantics.end_effector)
     target = read_target(urdf)
     robot = _build(cls, root, semantics, ee_frame, name, urdf, srdf, (), target, options)
     of_files += semantics_findings(robot, semantics, root)
-    return _with_findings(robot, findings, of_files)
+    return _with_findings(replace(robot, without=without), findings, of_files)
 
 
 def from_modules(

@@ -15,6 +15,7 @@ import pinocchio as pin
 from gym_mara.errors import GymMaraError, finite_numbers
 from gym_mara.robot import catalog
 from gym_mara.robot.bounds import Bounds
+from gym_mara.robot.catalog import RobotFiles
 from gym_mara.robot.collision_pairs import Pair, link_of
 from gym_mara.robot.description.off_chain import Follower
 from gym_mara.robot.description.shapes import Shape
@@ -71,6 +72,8 @@ class RobotModel:
     """What was added to the files."""
     findings: tuple[Finding, ...]
     """What is wrong with the files."""
+    without: tuple[str, ...] = ()
+    """The links of the URDF that were left out, such as the table of "mara_no_table"."""
     _unwarned: bool = field(default=False, init=False)
     """Whether the warnings for backends with dynamics are still to come."""
 
@@ -125,15 +128,14 @@ class RobotModel:
             path = Path(robot).absolute()
             srdf = path.with_suffix(".srdf")
             srdf_there = srdf if srdf.is_file() else None
-            return from_files(cls, path, ee_frame, srdf_there, None, own)
+            return from_files(cls, RobotFiles(path, srdf_there, ee_frame), None, own)
         if robot not in catalog.robot_names() and robot and os.path.lexists(robot):
             raise GymMaraError(
                 f"robot={robot!r} is no robot's name; for the file of that name write {os.path.join('.', robot)!r}"
             )
         files = catalog.find(robot)
-        frame = ee_frame or files.ee_frame
-        found = from_files(cls, files.urdf, frame, files.srdf, robot, own)
-        return with_notes(found)
+        files = files._replace(ee_frame=ee_frame or files.ee_frame)
+        return with_notes(from_files(cls, files, robot, own))
 
     @classmethod
     def from_urdf(
@@ -164,8 +166,8 @@ class RobotModel:
         Warns of what is probably not meant, see `findings`.
         """
         own = RobotOptions(**options)
-        found = from_files(cls, Path(urdf), ee_frame, Path(srdf) if srdf else None, name, own)
-        return found._checked()
+        files = RobotFiles(Path(urdf), Path(srdf) if srdf else None, ee_frame)
+        return from_files(cls, files, name, own)._checked()
 
     @classmethod
     def from_modules(cls, modules: Sequence[str], **options: Any) -> RobotModel:
@@ -277,8 +279,8 @@ class RobotModel:
         # Pinocchio's geometry does not pickle; a copy is loaded from the modules or the files.
         if self.modules:
             return from_modules, (RobotModel, self.modules, self.options, self.findings)
-        files = self.urdf, self.ee_frame, self.srdf, self.name
-        arguments = (RobotModel, *files, self.options, self.findings)
+        files = RobotFiles(self.urdf, self.srdf, self.ee_frame, self.without)
+        arguments = RobotModel, files, self.name, self.options, self.findings
         return from_files, arguments, {"_unwarned": self._unwarned}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RobotModel:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,6 +68,15 @@ class Semantics:
         """The first pose that names every one of these joints; without values if there is none."""
         fitting = (pose for pose in self.poses if all(joint in pose.values for joint in joints))
         return next(fitting, Pose("", {}))
+
+    def without(self, links: frozenset[str]) -> Semantics:
+        """The same without the pairs that name one of these links."""
+        return replace(
+            self,
+            disabled=frozenset(pair for pair in self.disabled if not pair & links),
+            enabled=frozenset(pair for pair in self.enabled if not pair & links),
+            disabled_links=self.disabled_links - links,
+        )
 
     @property
     def names(self) -> frozenset[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 
 from gym_mara.errors import GymMaraError, short
@@ -47,6 +48,16 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
     if residue := _xacro_in(root):
         raise _not_expanded(path, kind, residue)
     return root
+
+
+def remove_links(root: ElementTree.Element, links: Sequence[str]) -> frozenset[str]:
+    """Remove links from a URDF, each with the joint that carries it; returns their names."""
+    for element in [*root]:
+        child = element.find("child")
+        carried = element.get("name") if child is None else child.get("link")
+        if element.tag in ("link", "joint") and carried in links:
+            root.remove(element)
+    return frozenset(links)
 
 
 def _line_of(error: Exception, content: bytes) -> str:
