@@ -5,7 +5,7 @@ What does not move is drawn once for each camera and light, and kept (`_Backgrou
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gym_mara.rendering.camera import Camera
 from gym_mara.rendering.casting.looks import Looks
 from gym_mara.rendering.casting.rays import Float32s, Hits, Indices, Int32s
-from gym_mara.rendering.casting.shading import NOTHING, Photo, Seen, Surfaces, inside
+from gym_mara.rendering.casting.shading import NOTHING, Photo, Seen, Surfaces
 from gym_mara.rendering.scene import Scene
 from gym_mara.types import Floats, Mask
 
@@ -35,15 +35,24 @@ class Drawn(NamedTuple):
 
 
 class _Background(NamedTuple):
-    """What does not move in pictures of H · W pixels, for each of U looks; all arrays are (U · H · W, …)."""
+    """What does not move in pictures of K pixels, for each of U looks."""
 
-    seen: Seen
+    colour: Float32s
+    """RGB in [0, 1], in the shadow of fixed bodies alone (U, K, 3)."""
+    dark: Float32s
+    """RGB in the shadow (U, K, 3)."""
+    depth: Float32s
+    """As in Seen (U, K)."""
+    part: Int32s
+    """As in Seen (U, K)."""
+    normal: Float32s
+    """As in Seen (U, K, 3)."""
     lit: Mask
-    """Whether nothing fixed is between the point and the key light."""
+    """Whether it is in the light, of which a moving body can take it away (U, K)."""
     point: Float32s
-    """What is seen, in the world, m."""
+    """What is seen, in the world (U, K, 3), m."""
     across_light: Float32s
-    """The point in the plane across the key light, m."""
+    """The point in the plane across the key light (U, K, 2), m."""
 
 
 class Caster:
@@ -67,6 +76,7 @@ class Caster:
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
         self._points = (pixels - (np.array([width, height]) - 1.0) / 2.0).astype(np.float32)
         self._known: list[bytes] = []
+        self._most = 0
         self._background: _Background | None = None
 
     def draw(self, poses: Floats, looks: Looks) -> Drawn:
@@ -78,27 +88,31 @@ class Caster:
         """
         size, shape = len(self._points), (len(poses), self._height, self._width)
         behind, row = self._behind(poses, looks)
-        # Of each pixel of the N pictures, its place in the background.
-        place = (row[:, None] * size + np.arange(size)).ravel()
-        seen, lit = behind.seen.of(place), behind.lit[place]
-        moving = Photo(self._surfaces, self._moving, poses, looks, self._height)
-        photo = Photo(self._surfaces, self._fixed + self._moving, poses, looks, self._height)
-        changed = np.zeros(len(place), bool)
-        moved = self._add_moving(moving, seen)
-        changed[moved] = True
-        arm, pixel = np.divmod(moved, size)
-        points = photo.rays(arm, self._points[pixel]).at(seen.depth[moved])
-        lit[moved] = photo.lit(points, arm, seen.normal[moved])
-        shadow = self._shadow(moving, behind, place, np.flatnonzero(lit & ~changed))
-        lit[shadow], changed[shadow] = False, True
-        colour = seen.colour(lit)
-        edges = _edges(seen, lit, changed, shape)
-        if len(edges):
-            colour[edges] = self._finer(photo, *np.divmod(edges, size))
-        picture = np.uint8(255.0 * np.clip(colour, 0.0, 1.0) + 0.5)
-        return Drawn(
-            picture.reshape(*shape, 3), seen.depth.reshape(shape), seen.part.reshape(shape)
+        colour, depth = behind.colour[row], behind.depth[row]
+        part, lit = behind.part[row], behind.lit[row]
+        bodies = self._surfaces.bodies.all
+        moving, photo = (
+            Photo(self._surfaces, chosen, poses, looks, self._height)
+            for chosen in (self._moving, bodies)
         )
+        arm, pixel, new = self._see_moving(moving, depth)
+        depth[arm, pixel], part[arm, pixel] = new.depth, new.part
+        points = photo.rays(arm, self._points[pixel]).at(new.depth)
+        bright = photo.lit(points, arm, new.normal)
+        colour[arm, pixel] = new.colour(bright)
+        changed = np.zeros(lit.shape, bool)
+        changed[arm, pixel] = True
+        shadow = self._shadow(moving, behind, row, lit & ~changed)
+        fixed = row[shadow[0]], shadow[1]
+        colour[shadow] = behind.dark[fixed]
+        lit[arm, pixel], lit[shadow], changed[shadow] = bright, False, True
+        normal = np.empty((*lit.shape, 3), np.float32)  # only those that have changed are compared
+        normal[arm, pixel], normal[shadow] = new.normal, behind.normal[fixed]
+        edges = _edges(part, lit, normal, changed, shape)
+        if len(edges):
+            colour.reshape(-1, 3)[edges] = self._finer(photo, *np.divmod(edges, size))
+        picture = np.uint8(255.0 * np.clip(colour, 0.0, 1.0) + 0.5)
+        return Drawn(picture.reshape(*shape, 3), depth.reshape(shape), part.reshape(shape))
 
     def _behind(self, poses: Floats, looks: Looks) -> tuple[_Background, Indices]:
         """What does not move, for each different look, and which look each of the N arms has (N,)."""
@@ -106,49 +120,61 @@ class Caster:
         keys = [b"".join(values[i].tobytes() for values in own) for i in range(len(poses))]
         new = list(dict.fromkeys(key for key in keys if key not in self._known))
         if new or self._background is None:
-            first = [keys.index(key) for key in new]
-            drawn = self._draw_fixed(poses[first], looks.of(first))
-            kept = [i for i, key in enumerate(self._known) if key in keys]
-            if self._background is not None and kept:
-                drawn = _joined(_rows(self._background, kept, len(self._known)), drawn)
+            drawn = self._draw_fixed(poses, looks, [keys.index(key) for key in new])
+            # Some of the arms may be drawn alone, and then all of them: twice as many looks are kept.
+            self._most = max(self._most, len(keys))
+            used = [i for i, key in enumerate(self._known) if key in keys]
+            others = [i for i, key in enumerate(self._known) if key not in keys]
+            room = max(2 * self._most - len(used) - len(new), 0)
+            kept = [*others[len(others) - min(room, len(others)) :], *used]
+            if self._background is not None:
+                pairs = zip(self._background, drawn, strict=True)
+                drawn = _Background._make(np.concatenate([one[kept], two]) for one, two in pairs)
             self._known = [*(self._known[i] for i in kept), *new]
             self._background = drawn
         return self._background, np.array([self._known.index(key) for key in keys])
 
-    def _draw_fixed(self, poses: Floats, looks: Looks) -> _Background:
-        photo = Photo(self._surfaces, self._fixed, poses, looks, self._height)
-        arm = np.repeat(np.arange(len(poses)), len(self._points))
-        rays, seen = photo.see(arm, np.tile(self._points, (len(poses), 1)))
-        points = rays.at(np.where(seen.part == NOTHING, np.float32(0.0), seen.depth))
-        lit = photo.lit(points, arm, seen.normal) | (seen.part == NOTHING)
-        everywhere = np.ones(len(arm), bool)
-        edges = _edges(seen, lit, everywhere, (len(poses), self._height, self._width))
+    def _draw_fixed(self, poses: Floats, looks: Looks, arms: list[int]) -> _Background:
+        """What does not move in the pictures of some arms."""
+        photo = Photo(self._surfaces, self._fixed, poses[arms], looks.of(arms), self._height)
+        arm = np.repeat(np.arange(len(arms)), len(self._points))
+        rays, seen = photo.see(arm, np.tile(self._points, (len(arms), 1)))
+        solid = seen.part != NOTHING
+        points = rays.at(np.where(solid, seen.depth, np.float32(0.0)))
+        lit = photo.lit(points, arm, seen.normal) | ~solid
+        colour, dark = seen.colour(lit), seen.dark
+        shape = len(arms), self._height, self._width
+        edges = _edges(seen.part, lit, seen.normal, np.ones(len(lit), bool), shape)
         if len(edges):
-            fine = self._finer(photo, *np.divmod(edges, len(self._points)))
             # Where a shadow falls on an edge later, its pixel is drawn again.
-            seen.bright[edges] = seen.dark[edges] = fine
-        return _Background(seen, lit, points, photo.across_light(points, arm))
+            fine = self._finer(photo, *np.divmod(edges, len(self._points)))
+            colour[edges] = dark[edges] = fine
+        made = (colour, dark, seen.depth, seen.part, seen.normal, lit & solid, points)
+        return _Background._make(
+            values.reshape(len(arms), len(self._points), *values.shape[1:])
+            for values in (*made, photo.across_light(points, arm))
+        )
 
-    def _add_moving(self, moving: Photo, seen: Seen) -> Indices:
-        """Enter the moving bodies in what is seen, and return the pixels where they are, as indices of all pictures."""
-        size = len(self._points)
-        chosen = [self._within(box) for box in moving.in_picture.swapaxes(0, 1)]
-        near = np.zeros(len(seen.part), bool)
-        for pixels in chosen:
+    def _see_moving(self, moving: Photo, depth: Float32s) -> tuple[Indices, Indices, Seen]:
+        """The pixels where moving bodies are, each by its arm and its index in the picture, and what is seen there.
+
+        Args:
+            moving: the moving bodies.
+            depth: of what does not move (N, K), m.
+        """
+        boxes = [self._within(box) for box in moving.in_picture.swapaxes(0, 1)]
+        near = np.zeros(depth.size, bool)
+        for pixels in boxes:
             near[pixels] = True
-        all_near = np.flatnonzero(near)
-        number = np.cumsum(near) - 1
-        arm, pixel = np.divmod(all_near, size)
-        rays = moving.rays(arm, self._points[pixel])
-        hits = Hits.none(len(all_near))
-        hits.distance[:] = seen.depth[all_near]
-        for body, pixels in zip(moving.bodies, chosen, strict=True):
+        chosen = np.flatnonzero(near)
+        number = np.cumsum(near, dtype=np.int64) - 1
+        arm, pixel = np.divmod(chosen, len(self._points))
+        rays, hits = moving.rays(arm, self._points[pixel]), Hits.none(len(chosen))
+        hits.distance[:] = depth.ravel()[chosen]
+        for body, pixels in zip(moving.bodies, boxes, strict=True):
             moving.cast(body, rays, number[pixels], hits)
         hit = np.flatnonzero(hits.face >= 0)
-        new = moving.shade(rays.of(hit), hits.of(hit))
-        for values, own in zip(seen, new, strict=True):
-            values[all_near[hit]] = own
-        return all_near[hit]
+        return arm[hit], pixel[hit], moving.shade(rays.of(hit), hits.of(hit))
 
     def _within(self, box: Floats) -> Indices:
         """The pixels of all pictures, as indices, within a rectangle of each picture (N, 2, 2)."""
@@ -163,17 +189,27 @@ class Caster:
         return np.repeat(corner, count) + row * self._width + column
 
     def _shadow(
-        self, moving: Photo, behind: _Background, place: Indices, pixels: Indices
-    ) -> Indices:
-        """Those of the pixels, which show something fixed in the light, that are in the shadow of a moving body."""
+        self, moving: Photo, behind: _Background, row: Indices, lit: Mask
+    ) -> tuple[Indices, Indices]:
+        """The pixels, each by its arm and its index, in the shadow of a moving body, of those that show something fixed in the light.
+
+        Args:
+            moving: the moving bodies.
+            behind: what does not move.
+            row: which look each arm has (N,).
+            lit: the pixels that show something fixed in the light (N, K).
+        """
         box = moving.in_light
-        around = np.stack([box[:, :, 0].min(axis=1), box[:, :, 1].max(axis=1)], axis=1)
-        arm = pixels // len(self._points)
-        flat = behind.across_light[place[pixels]]
-        near = inside(flat, around[arm]) & (behind.seen.part[place[pixels]] != NOTHING)
-        pixels, arm = pixels[near], arm[near]
-        points, normal = behind.point[place[pixels]], behind.seen.normal[place[pixels]]
-        return pixels[~moving.lit(points, arm, normal)]
+        low, high = box[:, :, 0].min(axis=1)[:, None], box[:, :, 1].max(axis=1)[:, None]
+        near = lit
+        for axis in (0, 1):
+            flat = behind.across_light[..., axis]
+            flat = flat if len(flat) == 1 else flat[row]
+            near = near & (flat >= low[..., axis]) & (flat <= high[..., axis])
+        arm, pixel = np.nonzero(near)
+        points, normal = behind.point[row[arm], pixel], behind.normal[row[arm], pixel]
+        dark = ~moving.lit(points, arm, normal)
+        return arm[dark], pixel[dark]
 
     def _finer(self, photo: Photo, arm: Indices, pixel: Indices) -> Float32s:
         """RGB of pixels at edges (R, 3): the means of four rays each."""
@@ -187,37 +223,27 @@ class Caster:
         return seen.colour(lit).reshape(count, -1, 3).mean(axis=0)
 
 
-def _rows(background: _Background, kept: list[int], count: int) -> _Background:
-    """The background of some of `count` looks."""
+def _edges(
+    part: Int32s, lit: Mask, normal: Float32s, changed: Mask, shape: tuple[int, int, int]
+) -> Indices:
+    """The pixels, as indices, that differ from a neighbour in the part, in the normal, or in being lit, where one of both has changed.
 
-    def of(values: Any) -> Any:
-        return values.reshape(count, -1, *values.shape[1:])[kept].reshape(-1, *values.shape[1:])
-
-    lit, point, across = (of(values) for values in background[1:])
-    return _Background(Seen._make(map(of, background.seen)), lit, point, across)
-
-
-def _joined(one: _Background, other: _Background) -> _Background:
-    """The background of all looks of two."""
-    seen = Seen._make(map(np.concatenate, zip(one.seen, other.seen, strict=True)))
-    return _Background(
-        seen,
-        np.concatenate([one.lit, other.lit]),
-        np.concatenate([one.point, other.point]),
-        np.concatenate([one.across_light, other.across_light]),
-    )
-
-
-def _edges(seen: Seen, lit: Mask, changed: Mask, shape: tuple[int, int, int]) -> Indices:
-    """The pixels, as indices, that differ from a neighbour in the part, in the normal, or in being lit, where one of both has changed."""
-    part, bright, new = (values.reshape(shape) for values in (seen.part, lit, changed))
-    normal = seen.normal.reshape(*shape, 3)
+    Args:
+        part: of each pixel, and so on.
+        lit: whether it is in the light.
+        normal: where it has changed.
+        changed: whether it has changed.
+        shape: of the pictures: N, H, W.
+    """
+    part, normal = part.reshape(shape), normal.reshape(*shape, 3)
+    bright, new = lit.reshape(shape), changed.reshape(shape)
     edges = np.zeros(shape, np.bool_)
     for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
         differs = (part[one] != part[other]) | (bright[one] != bright[other])
         differs &= new[one] | new[other]
-        solid = (part[one] >= 0) & (part[other] >= 0) & new[one] & ~differs
-        differs[solid] = np.vecdot(normal[one][solid], normal[other][solid]) < _EDGE_COSINE
+        solid = new[one] & new[other] & (part[one] >= 0) & (part[other] >= 0) & ~differs
+        moved = np.nonzero(solid)
+        differs[moved] = np.vecdot(normal[one][moved], normal[other][moved]) < _EDGE_COSINE
         edges[one] |= differs
         edges[other] |= differs
     return np.flatnonzero(edges)

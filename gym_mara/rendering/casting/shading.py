@@ -94,7 +94,8 @@ class Photo:
         self._scale: Float32s = scale
         local = np.matmul(corners - looks.eye[:, None, None], looks.axes[:, None])
         flat = scale[:, None, None, None] * local[..., :2] / np.maximum(local[..., 2:], _NEAR)
-        self.in_picture = np.stack([flat.min(axis=2), flat.max(axis=2)], axis=2)
+        ends = np.stack([flat.min(axis=2), flat.max(axis=2)], axis=2)
+        self.in_picture: Float32s = ends.astype(np.float32)
         """The lowest and highest corner of the rectangle around each body in the pictures (N, bodies, 2, 2), pixels from the middle."""
         # A box that begins behind the camera may be anywhere in the picture.
         behind = (local[..., 2] < _NEAR).any(axis=2)
