@@ -29,6 +29,8 @@ if threading.current_thread() is threading.main_thread():
 
 # Helper processes of multiprocessing, which live as long as the process that uses them.
 _HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+_LISTED = Path(f"/proc/self/task/{os.getpid()}/children").exists()
+"""Whether the kernel lists the children of a process."""
 _GRACE_PERIOD = 10.0
 """The time for a process to end after its test, s."""
 
@@ -55,7 +57,7 @@ def small_files() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _no_process_is_left_behind() -> Iterator[None]:
     """Fail a test that leaves child processes behind, and kill them."""
-    before = set(psutil.Process().children())
+    before = _children()
     yield
     deadline = time.monotonic() + _GRACE_PERIOD
     while (remaining := _new_children(before)) and time.monotonic() < deadline:
@@ -70,10 +72,25 @@ def _no_process_is_left_behind() -> Iterator[None]:
     assert not commands, f"the test left these processes behind: {commands}"
 
 
+def _children() -> set[psutil.Process]:
+    """The child processes. psutil reads about all processes of the machine, and tests are many."""
+    if not _LISTED:
+        return set(psutil.Process().children())
+    found = set()
+    try:
+        for path in Path("/proc/self/task").glob("*/children"):
+            for pid in path.read_text().split():
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    found.add(psutil.Process(int(pid)))
+    except OSError:  # a thread has ended meanwhile
+        return set(psutil.Process().children())
+    return found
+
+
 def _new_children(before: set[psutil.Process]) -> list[psutil.Process]:
     """The living child processes that are not in `before`, without the helpers of multiprocessing."""
     children = []
-    for process in set(psutil.Process().children()) - before:
+    for process in _children() - before:
         with contextlib.suppress(psutil.NoSuchProcess):
             command = " ".join(process.cmdline())  # empty for a zombie
             if command and not any(name in command for name in _HELPERS):

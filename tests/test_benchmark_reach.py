@@ -22,7 +22,7 @@ from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import AnyTargetTask
-from tests.agents.conftest import config, silent
+from tests.agents.conftest import config, shorten_episodes, silent
 from tests.helpers import write
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -46,6 +46,7 @@ def test_one_command_makes_the_pictures_and_tables_of_runs_that_reach_any_target
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    shorten_episodes(monkeypatch, 60)
     folders, out = [tmp_path / name for name in "abc"], tmp_path / "results"
     runs = zip(("MARAReach-v0", "MARAReach-v0", "MARAPose-v0"), (0, 1, 0), folders, strict=True)
     for env, seed, folder in runs:

@@ -24,6 +24,7 @@ from gym_mara.cli.common import whole
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
 from gym_mara.tasks import ReachTask, registry
+from tests.agents.conftest import shorten_episodes
 from tests.helpers import Cli
 
 
@@ -67,9 +68,12 @@ def test_a_setting_that_looks_like_json_must_be_json(gym_mara: Cli, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_train_then_evaluate(gym_mara: Cli, tmp_path: Path) -> None:
+def test_train_then_evaluate(
+    gym_mara: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shorten_episodes(monkeypatch, 256)
     run = tmp_path / "run"
-    code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "4096", "--out", run)
+    code, out, _ = gym_mara("train", "--env", "gym_mara/MARA-v0", "--steps", "1024", "--out", run)
     assert code == 0
     assert "position error, mm" in out
     everywhere = ("--backend", "dart,mujoco,pinocchio")

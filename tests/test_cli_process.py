@@ -49,7 +49,8 @@ def test_an_interrupted_training_says_what_is_saved(
     tmp_path: Path, number: signal.Signals, every: str, message: str
 ) -> None:
     run, errors = tmp_path / "run", tmp_path / "errors"
-    command = [*GYM_MARA, "train", "--steps", "1e7", "--checkpoint-every", every, "--out", str(run)]
+    command = [*GYM_MARA, "train", "--env", "MARAGoal-v0", "--steps", "1e7"]
+    command += ["--checkpoint-every", every, "--out", str(run)]
     # A signal that is ignored, as SIGHUP where the tests run under nohup, would stay ignored.
     usual = "default_int_handler" if number == signal.SIGINT else "SIG_DFL"
     code = f"import signal, sys; signal.signal({int(number)}, signal.{usual}); "

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
+from gym_mara.backends import simulated_backends
 from gym_mara.envs import MaraEnv
 from gym_mara.robot import RobotLike, RobotModel
 from gym_mara.tasks import TASKS
-from tests.helpers import DEVICES, EVERY_BACKEND, MODULAR_ARMS
+from tests.helpers import DEVICES, MODULAR_ARMS
 
 ARMS: dict[str, RobotLike] = {
     **{name: name for name in ("ur5", "ur10", "panda", "so100", "talos_arm")},
@@ -16,8 +19,16 @@ ARMS: dict[str, RobotLike] = {
 }
 
 
-@pytest.mark.parametrize("backend", EVERY_BACKEND)
-@pytest.mark.parametrize("arm", ARMS)
+# Warp compiles its kernels for each arm, which takes seconds: CI has an arm with a gripper, a small one, and few and many joints.
+IN_CI = ("panda", "so100", "modular 3", "modular 7")
+NIGHTLY = [pytest.param(arm, "warp", marks=pytest.mark.nightly) for arm in ARMS if arm not in IN_CI]
+WARP = [pytest.param(arm, "warp", marks=pytest.mark.slow) for arm in IN_CI]
+
+
+@pytest.mark.parametrize(
+    ("arm", "backend"),
+    [*itertools.product(ARMS, sorted({*simulated_backends()} - {*DEVICES})), *WARP, *NIGHTLY],
+)
 def test_an_arm_runs_every_task_and_can_be_drawn(arm: str, backend: str) -> None:
     rng, source = np.random.default_rng(0), ARMS[arm]
     hulls = backend == "warp"  # which knows only convex shapes

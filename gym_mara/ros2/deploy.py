@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -331,6 +332,7 @@ class Deployment:
             self._arms.close()
         finally:
             self._checks.shutdown(wait=False, cancel_futures=True)
+            gc.unfreeze()
 
 
 def _as_options(target: Target) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import threading
 from collections import deque
@@ -96,6 +97,8 @@ class Driver:
             spare_what_is_loaded()
             self._thread = threading.Thread(target=self._run, name="gym_mara driver", daemon=True)
             self._thread.start()
+            # At the end of a process that does not close it, the arm comes to rest, and what was spared is freed.
+            atexit.register(self.close)
 
     def _reported(self) -> ArmState:
         if (state := self.link.state) is None:
@@ -227,5 +230,6 @@ class Driver:
             self._ending = True  # the thread ends when the arm has stopped
             thread.join(self.safety.longest_stop + _MARGIN)
             self._thread = None
+            atexit.unregister(self.close)
             gc.unfreeze()
         self.link.close()

@@ -121,7 +121,7 @@ def test_it_gives_the_results_of_single_envs(
         control_period=0.1,
         max_episode_steps=9,
     )
-    _assert_same_results(native, singles, 25 if count == 40 else 40)
+    _assert_same_results(native, singles, 14 if count == 40 else 40)
 
 
 @pytest.mark.parametrize("name", ENV_IDS)

@@ -60,7 +60,7 @@ def test_without_a_delay_and_noise_the_ranges_stay_positive(mara: RobotModel) ->
     assert 0.0 <= low <= high < 0.005
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_joints(mara: RobotModel) -> None:
     joints = [0, 1, 2]
     true = hidden(mara, 2, joints)

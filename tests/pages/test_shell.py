@@ -148,9 +148,11 @@ def shortened(arguments: list[str]) -> list[str]:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the runs, the exported policy and the arms that pages speak of."""
     folder = tmp_path_factory.mktemp("pages")
-    for name, env in (("first", "MARA-v0"), ("reach", "MARAReach-v0")):
-        config = RunConfig(env=env, algo="ppo", backend="pinocchio", steps=300, seed=0)
-        run = train(config, folder / "runs" / name, lambda *_: None)
+    with pytest.MonkeyPatch.context() as patch:
+        shorten_episodes(patch, 50)
+        for name, env in (("first", "MARA-v0"), ("reach", "MARAReach-v0")):
+            config = RunConfig(env=env, algo="ppo", backend="pinocchio", steps=300, seed=0)
+            run = train(config, folder / "runs" / name, lambda *_: None)
     export(run, folder / "policy.onnx")
     for name in ("arm", "my_arm"):
         for kind in ("urdf", "srdf"):

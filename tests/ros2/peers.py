@@ -42,7 +42,10 @@ class Peer:
         client = self.ros.node.create_client(kind, name)
         assert client.wait_for_service(timeout_sec=8.0)
         future = client.call_async(kind.Request())
-        eventually(future.done)
+        try:
+            eventually(future.done)
+        finally:
+            self.ros.node.destroy_client(client)
         return future.result()
 
     def close(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -247,6 +248,15 @@ def test_set_does_not_move_the_arm_in_a_dry_run(gym_mara: Cli, name: str) -> Non
     code, _, error = gym_mara("ros2", "deploy", "policy.onnx", "--set", f"{name}=true")
     assert code == 2
     assert f"--set {name} has no effect here: give --{name}" in error
+
+
+def test_what_was_spared_from_garbage_collections_is_freed_at_the_end(
+    deploy: Callable[..., Deployment],
+) -> None:
+    deployment = deploy()
+    assert gc.get_freeze_count() > 0
+    deployment.close()
+    assert gc.get_freeze_count() == 0
 
 
 def test_an_environment_that_cannot_be_made_leaves_no_arm_driven(

@@ -197,7 +197,7 @@ def stage(ros_domain: int) -> Iterator[Stage]:
 
 @pytest.mark.parametrize(
     "faults",
-    [pytest.param(12, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.nightly)],
+    [pytest.param(6, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.nightly)],
 )
 def test_whatever_fails_the_arm_holds_and_stays_within_its_limits(
     stage: Stage, faults: int

@@ -23,38 +23,21 @@ from filelock import FileLock
 
 from gym_mara.agents.algorithms.registry import ALGORITHMS, algorithm
 from gym_mara.agents.experiments import grid as grid_module
-from gym_mara.agents.experiments.executor import Executor, Send
 from gym_mara.agents.experiments.figures import format_interval, interquartile_mean, plot_grid
-from gym_mara.agents.experiments.grid import Grid, open_grid, read_result, run_grid
+from gym_mara.agents.experiments.grid import open_grid, read_result, run_grid
 from gym_mara.agents.experiments.local_executor import run_in_processes
-from gym_mara.backends.workers import choose_workers
 from gym_mara.errors import GymMaraError
+from tests.agents.experiments import jobs
+from tests.agents.experiments.conftest import GRID, ignore, in_this_process
 from tests.helpers import started
 
 pytestmark = pytest.mark.slow
 
-GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
-
-
-def ignore(name: str, message: Any) -> None:
-    """Messages go nowhere."""
-
-
-def processes(number: int) -> Executor:
-    """An executor with this many local processes."""
-    return partial(run_in_processes, processes=number)
-
-
-@pytest.fixture(scope="session")
-def finished_grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A grid that was trained to its end; tests must not change it."""
-    folder = Path(tmp_path_factory.mktemp("grids")) / "grid"
-    assert run_grid(folder, GRID, processes(2), ignore) == {}
-    return folder
+two_processes = partial(run_in_processes, processes=2)
 
 
 def test_every_run_writes_its_result(finished_grid: Path) -> None:
-    assert set(GRID.runs()) == {f"MARA-v0_{algo}_0" for algo in GRID.algos}
+    assert set(GRID.runs()) == {f"MARAGoal-v0_{algo}_0" for algo in GRID.algos}
     for name in GRID.runs():
         result = read_result(finished_grid / name)
         assert result is not None
@@ -65,7 +48,7 @@ def test_every_run_writes_its_result(finished_grid: Path) -> None:
 def test_finished_runs_are_not_trained_again(finished_grid: Path) -> None:
     senders: list[str] = []
     assert (
-        run_grid(finished_grid, GRID, processes(1), lambda name, message: senders.append(name))
+        run_grid(finished_grid, GRID, in_this_process, lambda name, message: senders.append(name))
         == {}
     )
     assert not senders
@@ -75,7 +58,7 @@ def test_a_killed_grid_is_resumed_with_the_same_results(
     finished_grid: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "grid"
-    options = ["--env", "MARA-v0", "--algo", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
+    options = ["--env", "MARAGoal-v0", "--algo", "ppo,acktr", "--seeds", "1", "--steps", "4096"]
     command = ["-m", "gym_mara.cli", "benchmark", *options, "--jobs", "2"]
     command += ["--checkpoint-every", "2048", "--out", str(folder)]
     with started(*command) as process:
@@ -84,7 +67,7 @@ def test_a_killed_grid_is_resumed_with_the_same_results(
             assert process.poll() is None, "the grid ended early"
             assert time.monotonic() < deadline
             time.sleep(0.01)
-    assert run_grid(folder, GRID, processes(2), ignore) == {}
+    assert run_grid(folder, GRID, in_this_process, ignore) == {}
     for name in GRID.runs():
         mine, theirs = read_result(folder / name), read_result(finished_grid / name)
         assert mine is not None
@@ -96,13 +79,13 @@ def test_a_killed_grid_is_resumed_with_the_same_results(
 def test_a_damaged_run_is_renamed_and_trained_again(
     finished_grid: Path, tmp_path: Path, victim: str
 ) -> None:
-    folder, name = tmp_path / "grid", "MARA-v0_acktr_0"
+    folder, name = tmp_path / "grid", "MARAGoal-v0_acktr_0"
     shutil.copytree(finished_grid, folder)
     before = read_result(folder / name)
     (folder / name / "result.json").unlink()
     (folder / name / victim).write_bytes(b"\x00 no such thing")
     messages: list[Any] = []
-    assert run_grid(folder, GRID, processes(1), lambda *sent: messages.append(sent)) == {}
+    assert run_grid(folder, GRID, in_this_process, lambda *sent: messages.append(sent)) == {}
     assert any(who == name and "renamed" in str(message) for who, message in messages)
     assert (folder / f"{name}.damaged1").is_dir()
     after = read_result(folder / name)
@@ -112,12 +95,12 @@ def test_a_damaged_run_is_renamed_and_trained_again(
 
 
 def test_a_damaged_result_is_renamed_and_written_again(finished_grid: Path, tmp_path: Path) -> None:
-    folder, name = shutil.copytree(finished_grid, tmp_path / "grid"), "MARA-v0_ppo_0"
+    folder, name = shutil.copytree(finished_grid, tmp_path / "grid"), "MARAGoal-v0_ppo_0"
     before = read_result(folder / name)
     assert before is not None
     (folder / name / "result.json").write_text("{}")
     messages: list[Any] = []
-    assert run_grid(folder, GRID, processes(1), lambda *sent: messages.append(sent)) == {}
+    assert run_grid(folder, GRID, in_this_process, lambda *sent: messages.append(sent)) == {}
     assert messages[0] == (
         name,
         "result.json is damaged; renamed to 'result.json.damaged1' and written again",
@@ -133,12 +116,12 @@ def test_runs_that_failed_on_a_full_disk_are_resumed(finished_grid: Path, tmp_pa
         resource.setrlimit(
             resource.RLIMIT_FSIZE, (20_000, hard)
         )  # for every file, as on a full disk
-        failed = run_grid(tmp_path / "grid", GRID, processes(2), ignore)
+        failed = run_grid(tmp_path / "grid", GRID, two_processes, ignore)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert failed.keys() == GRID.runs().keys()
     assert all("File too large" in reason for reason in failed.values())
-    assert run_grid(tmp_path / "grid", GRID, processes(2), ignore) == {}
+    assert run_grid(tmp_path / "grid", GRID, in_this_process, ignore) == {}
     for name in GRID.runs():
         mine, theirs = read_result(tmp_path / "grid" / name), read_result(finished_grid / name)
         assert mine is not None
@@ -197,7 +180,7 @@ def test_a_folder_with_another_grid_is_refused(
         ({"envs": ("MARA-v1",)}, "environment"),
         ({"algos": ("ppo2",)}, "algorithm"),
         ({"preset_name": "papers"}, "preset"),
-        ({"envs": ("MARA-v0", "MARA-v0")}, "give each name once"),
+        ({"envs": ("MARAGoal-v0", "MARAGoal-v0")}, "give each name once"),
         ({"algos": ("ppo", "ppo")}, "give each name once"),
         ({"seeds": 0}, "seeds"),
         ({"steps": -1}, "steps"),
@@ -213,9 +196,9 @@ def test_figures_and_tables_contain_every_run(finished_grid: Path, tmp_path: Pat
     finished_grid = shutil.copytree(finished_grid, tmp_path / "grid")
     files = plot_grid(finished_grid)
     assert {file.name for file in files} == {
-        "MARA-v0.png",
-        "MARA-v0_acktr.png",
-        "MARA-v0_ppo.png",
+        "MARAGoal-v0.png",
+        "MARAGoal-v0_acktr.png",
+        "MARAGoal-v0_ppo.png",
         "curves.csv",
         "table.csv",
         "table.md",
@@ -224,8 +207,8 @@ def test_figures_and_tables_contain_every_run(finished_grid: Path, tmp_path: Pat
         rows = list(csv.DictReader(stream))
     assert {(row["algo"], row["seed"]) for row in rows} == {("ppo", "0"), ("acktr", "0")}
     text = (finished_grid / "table.md").read_text()
-    assert "| MARA-v0 | PPO | 1 |" in text
-    assert "| MARA-v0 | ACKTR | 1 |" in text
+    assert "| MARAGoal-v0 | PPO | 1 |" in text
+    assert "| MARAGoal-v0 | ACKTR | 1 |" in text
 
 
 def test_a_finished_run_that_was_damaged_later_is_reported(
@@ -233,17 +216,23 @@ def test_a_finished_run_that_was_damaged_later_is_reported(
 ) -> None:
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
-    (folder / "MARA-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
-    with pytest.raises(GymMaraError, match=r"MARA-v0_ppo_0' is damaged.*train it again"):
+    (folder / "MARAGoal-v0_ppo_0" / "progress.csv").write_text("time/total_timesteps\nmany\n")
+    with pytest.raises(GymMaraError, match=r"MARAGoal-v0_ppo_0' is damaged.*train it again"):
         plot_grid(folder)
 
 
 def test_unfinished_runs_are_left_out_of_the_figures(finished_grid: Path, tmp_path: Path) -> None:
     folder = tmp_path / "grid"
     shutil.copytree(finished_grid, folder)
-    (folder / "MARA-v0_acktr_0" / "result.json").unlink()
+    (folder / "MARAGoal-v0_acktr_0" / "result.json").unlink()
     files = {file.name for file in plot_grid(folder)}
-    assert files == {"MARA-v0.png", "MARA-v0_ppo.png", "curves.csv", "table.csv", "table.md"}
+    assert files == {
+        "MARAGoal-v0.png",
+        "MARAGoal-v0_ppo.png",
+        "curves.csv",
+        "table.csv",
+        "table.md",
+    }
 
 
 def test_a_folder_without_results_has_no_figures(tmp_path: Path) -> None:
@@ -263,48 +252,26 @@ def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
     assert format_interval(interquartile_mean([1.0, np.inf, np.inf]), 1) == "-"
 
 
-def _die(send: Send) -> None:
-    send("alive")
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _greet(send: Send) -> None:
-    send("hello")
-
-
-def _fill_the_disk(send: Send) -> None:
-    raise OSError(28, "No space left on device")
-
-
-def _divide_by_zero(send: Send) -> None:
-    raise ZeroDivisionError("in the job")
-
-
-def _send_workers(send: Send) -> None:
-    send(choose_workers(12, None))
-
-
 def test_the_backend_of_a_job_starts_no_workers() -> None:
     messages: list[Any] = []
-    run_in_processes({"one": _send_workers}, lambda name, message: messages.append(message), 1)
+    run_in_processes({"one": jobs.send_workers}, lambda name, message: messages.append(message), 1)
     assert messages == [1]
 
 
 def test_a_job_that_fails_does_not_stop_the_others() -> None:
     messages: list[tuple[str, Any]] = []
-    jobs = {"dead": _die, "full": _fill_the_disk, "broken": _divide_by_zero, "good": _greet}
-    failed = run_in_processes(jobs, lambda *sent: messages.append(sent), 1)
+    all_of_them = {
+        "dead": jobs.die,
+        "full": jobs.fill_the_disk,
+        "broken": jobs.divide_by_zero,
+        "good": jobs.greet,
+    }
+    failed = run_in_processes(all_of_them, lambda *sent: messages.append(sent), 1)
     assert failed.keys() == {"dead", "full", "broken"}
-    assert "_divide_by_zero" in failed["broken"], "the traceback"
+    assert "divide_by_zero" in failed["broken"], "the traceback"
     assert "ended by SIGKILL" in failed["dead"]
     assert "No space left" in failed["full"]
     assert ("good", "hello") in messages
-
-
-def _sleep(file: Path, send: Send) -> None:
-    file.write_text(str(os.getpid()))
-    send("started")
-    time.sleep(600)
 
 
 def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
@@ -315,7 +282,7 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
     file = tmp_path / "pid"
     before = dict(os.environ)
     with pytest.raises(KeyboardInterrupt):
-        run_in_processes({"sleeping": partial(_sleep, file)}, interrupt, 1)
+        run_in_processes({"sleeping": partial(jobs.sleep, file)}, interrupt, 1)
     assert dict(os.environ) == before
     with pytest.raises(ProcessLookupError):
         os.kill(int(file.read_text()), 0)
@@ -340,7 +307,7 @@ def test_an_interrupt_leaves_no_process_that_has_just_started(
     other.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_in_processes({"sleeping": partial(_sleep, tmp_path / "pid")}, ignore, 1)
+            run_in_processes({"sleeping": partial(jobs.sleep, tmp_path / "pid")}, ignore, 1)
     finally:
         end.set()
         other.join()

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,14 @@ import pytest
 import ray
 
 from gym_mara.agents.experiments.executor import Send
-from gym_mara.agents.experiments.grid import Grid, read_result, run_grid, run_one
-from gym_mara.agents.experiments.local_executor import run_in_processes
+from gym_mara.agents.experiments.grid import read_result, run_grid, run_one
 from gym_mara.agents.experiments.ray_executor import run_on_ray
 from gym_mara.backends.workers import choose_workers
 from gym_mara.cli.experiments import _executor
 from gym_mara.errors import GymMaraError
+from tests.agents.experiments.conftest import GRID
 
 pytestmark = pytest.mark.slow
-
-GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096, checkpoint_every=2048)
 
 
 @pytest.fixture(scope="module")
@@ -36,26 +33,23 @@ def cluster() -> Iterator[None]:
     ray.shutdown()
 
 
-def ignore(name: str, message: Any) -> None:
-    """Messages go nowhere."""
-
-
 @pytest.mark.usefixtures("cluster")
-def test_a_grid_gives_the_same_results_if_a_worker_is_killed(tmp_path: Path) -> None:
+def test_a_grid_gives_the_same_results_if_a_worker_is_killed(
+    finished_grid: Path, tmp_path: Path
+) -> None:
     killed: list[int] = []
 
     def kill_a_worker(name: str, message: Any) -> None:
-        worker = _worker("MARA-v0_ppo_0")
-        checkpoints = list((tmp_path / "ray").glob("MARA-v0_ppo_0/checkpoints/*"))
+        worker = _worker("MARAGoal-v0_ppo_0")
+        checkpoints = list((tmp_path / "ray").glob("MARAGoal-v0_ppo_0/checkpoints/*"))
         if not killed and checkpoints and worker is not None:
             os.kill(worker, signal.SIGKILL)
             killed.append(worker)
 
     assert run_grid(tmp_path / "ray", GRID, run_on_ray, kill_a_worker) == {}
     assert killed, "the grid ended before a worker could be killed"
-    assert run_grid(tmp_path / "local", GRID, partial(run_in_processes, processes=2), ignore) == {}
     for name in GRID.runs():
-        mine, theirs = read_result(tmp_path / "ray" / name), read_result(tmp_path / "local" / name)
+        mine, theirs = read_result(tmp_path / "ray" / name), read_result(finished_grid / name)
         assert mine is not None
         assert theirs is not None
         assert mine["last"] == theirs["last"]

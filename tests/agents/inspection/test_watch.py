@@ -327,8 +327,16 @@ def test_a_film_with_an_odd_size_is_cropped(tmp_path: Path) -> None:
     assert pictures(film).shape == (3, 100, 160, 3)
 
 
+@pytest.fixture
+def short_films(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The video of a report has one second."""
+    monkeypatch.setattr(report_module, "_VIDEO_SECONDS", 1)
+
+
 @pytest.mark.slow
-def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_a_report_opens_without_a_network(
+    finished_run: RunFolder, tmp_path: Path, short_films: None
+) -> None:
     file = write_report(finished_run, tmp_path / "report.html")
     requests, errors = [], []
     with chromium() as browser:
@@ -351,7 +359,7 @@ def test_a_report_opens_without_a_network(finished_run: RunFolder, tmp_path: Pat
         page.locator(".js-plotly-plot .main-svg").first.wait_for()
         assert page.locator(".js-plotly-plot").count() == 5
         until_loaded = "video => new Promise(done => video.readyState ? done(video.duration) : (video.onloadedmetadata = () => done(video.duration)))"
-        assert page.locator("video").evaluate(until_loaded) == pytest.approx(4.5, abs=0.1)
+        assert page.locator("video").evaluate(until_loaded) == pytest.approx(1.5, abs=0.1)
         played = "async video => { await video.play(); await new Promise(r => setTimeout(r, 800)); return video.currentTime; }"
         assert page.locator("video").evaluate(played) > 0.1
         traces = (
@@ -392,7 +400,7 @@ def test_a_full_disk_ends_a_report_with_a_clear_error(
 
 @pytest.mark.slow
 def test_a_report_names_a_backend_that_is_not_installed(
-    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished_run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_films: None
 ) -> None:
     engines = {"dart": "dartpy", "mujoco": "mujoco"}
     packages = tuple(f"gym_mara.backends.{name}" for name in engines)
@@ -406,7 +414,9 @@ def test_a_report_names_a_backend_that_is_not_installed(
 
 
 @pytest.mark.slow
-def test_a_report_escapes_the_texts_of_a_run(finished_run: RunFolder, tmp_path: Path) -> None:
+def test_a_report_escapes_the_texts_of_a_run(
+    finished_run: RunFolder, tmp_path: Path, short_films: None
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(finished_run.path, run)
     hostile = "</pre><script>alert('a & b')</script>"

@@ -41,7 +41,7 @@ from gym_mara.agents.training import train as train_module
 from gym_mara.agents.training.train import preset_agent, preset_of, resume, train
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError, TrainingDivergedError
-from tests.agents.conftest import ROLLOUT, config, silent
+from tests.agents.conftest import EPISODE, ROLLOUT, config, silent
 from tests.helpers import started
 
 
@@ -240,7 +240,7 @@ def test_an_evaluation_has_each_metric_of_each_episode(finished_run: RunFolder) 
     # Start pose and policy are the same in every episode, so the results are the same up to rounding.
     for name, values in metrics.items():
         np.testing.assert_allclose(values, values[0], rtol=1e-5, err_msg=name)
-    np.testing.assert_allclose(metrics["return"], 2048 * metrics["reward_per_step"], rtol=1e-9)
+    np.testing.assert_allclose(metrics["return"], EPISODE * metrics["reward_per_step"], rtol=1e-9)
     summary = spread(metrics)
     assert tuple(summary["return"] or ()) == STATISTICS
 
