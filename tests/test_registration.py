@@ -42,7 +42,14 @@ def _run(code: str, folder: Path) -> str:
 
 def test_the_ids_are_registered() -> None:
     registered = {name for name in gymnasium.registry if name.startswith("gym_mara/")}
-    others = "MARARandomTarget-v0", "MARAGoal-v0", "MARAReach-v0", "MARAPose-v0", "MARAReal-v0"
+    others = (
+        "MARARandomTarget-v0",
+        "MARAGoal-v0",
+        "MARAReach-v0",
+        "MARAPose-v0",
+        "MARAReal-v0",
+        "MARACamera-v0",
+    )
     assert registered == {*ENV_IDS, *(f"gym_mara/{name}" for name in others)}
 
 
