@@ -15,7 +15,7 @@ PICTURES = 40
 STEPS = 3000
 ROUNDS = 9
 TARGETS = {"vtk": 60.0, "raycast": 200.0}
-ARMS, OBSERVED, PROCESSES = 16, 12, 2
+ARMS, OBSERVED, PROCESSES = 32, 10, 2
 """The arms of a vector environment, its steps, and how many processes have one each."""
 PIXELS: dict[str, dict[str, Any]] = {
     "camera of the scene": {},

@@ -113,6 +113,15 @@ def test_episodes_look_different_if_they_are_random_and_steps_do_not() -> None:
     np.testing.assert_array_equal(usual.reset(seed=0)[0], usual.reset()[0])
 
 
+def test_many_arms_are_drawn_in_threads_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = MaraVectorEnv(20, "MARARandomTarget-v0", **{**ALL, "pixel_randomisation": RANDOM})
+    seen, _ = env.reset(seed=0)
+    monkeypatch.setattr("gym_mara.rendering.casting.painter._ARMS_PER_THREAD", 10**6)
+    alone, _ = env.reset(seed=0)
+    _equal(seen, alone)
+    env.close()
+
+
 def test_a_copy_and_a_restored_snapshot_see_the_same() -> None:
     env = MaraEnv("MARAReach-v0", **ALL, pixel_randomisation=RANDOM)
     env.reset(seed=0)

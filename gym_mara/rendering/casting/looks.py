@@ -40,7 +40,7 @@ class Looks(NamedTuple):
     ground: Float32s
     """RGB of the middle of the floor and of the background (N, 2, 3), in [0, 1]."""
 
-    def of(self, chosen: Sequence[int]) -> Looks:
+    def of(self, chosen: Sequence[int] | NDArray[np.int64]) -> Looks:
         """Some of the looks."""
         return Looks._make(values[chosen] for values in self)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,12 @@ from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import PIXELS, TOOL, PixelSettings, RenderSettings
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
+from gym_mara.types import Floats
 
 _TOOL_EYE, _TOOL_AT = (-0.12, 0.0, -0.1), (-0.03, 0.0, 0.2)
 """Where the camera on the tool is and what it looks at, in the tool's frame, for an arm as long as MARA, m: beside the hand, along it."""
+_ARMS_PER_THREAD = 8
+"""Fewer arms are drawn in one thread."""
 _TOOL_ANGLE = 70.0
 """Its vertical angle of view, deg."""
 
@@ -43,7 +48,8 @@ class Painter:
         named: Any = "three_quarter" if settings.pixel_camera == TOOL else settings.pixel_camera
         chosen = RenderSettings(width=width, height=height, camera=named)
         self._camera = place_camera(self._scene, first, chosen)
-        self._caster = Caster(self._scene, self._camera, width, height)
+        # One for each thread, because a caster keeps what it has drawn.
+        self._casters: list[Caster] = []
         own = self._camera.eye, self._camera.at, self._camera.up
         if settings.pixel_camera == TOOL:
             size = self._scene.marker_scale
@@ -137,7 +143,23 @@ class Painter:
         if generators:
             light, colour = (random.get(name, 0.0) for name in ("light", "colour"))
             looks = looks.randomised(generators, light, colour, self._marker)
-        return self._caster.draw(poses, looks)
+        return self._cast(poses, looks)
+
+    def _cast(self, poses: Floats, looks: Looks) -> Drawn:
+        """Draw the arms, many of them in several threads: NumPy and Embree release the interpreter lock for a part of the time."""
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        threads = max(1, min(cores or 1, len(poses) // _ARMS_PER_THREAD))
+        height, width = self._settings.sides
+        while len(self._casters) < threads:
+            self._casters.append(Caster(self._scene, self._camera, width, height))
+        if threads == 1:
+            return self._casters[0].draw(poses, looks)
+        rows = np.array_split(np.arange(len(poses)), threads)
+        with ThreadPoolExecutor(threads) as pool:
+            drawn = pool.map(
+                lambda i: self._casters[i].draw(poses[rows[i]], looks.of(rows[i])), range(threads)
+            )
+            return Drawn._make(np.concatenate(values) for values in zip(*drawn, strict=True))
 
 
 def _key(channel: str) -> str:
