@@ -8,9 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from stable_baselines3 import PPO
 
+from gym_mara.agents.sb3 import MaraVecEnv
+from gym_mara.envs import MaraVectorEnv
 from tests.helpers import ENV_IDS
 
 pytestmark = pytest.mark.slow
@@ -18,6 +22,7 @@ pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CALLS = {
     "behaviour_cloning.py --episodes 8 --evaluate 4": "success",
+    "reach_from_pixels.py --minutes 0.05 --arms 4 --evaluate 1": "| the tool |",
     "sb3_ppo.py --way single": "position error",
     "sb3_ppo.py --way in_turn": "position error",
     "sb3_ppo.py --way in_processes": "position error",
@@ -44,8 +49,32 @@ def test_no_example_is_forgotten() -> None:
 @pytest.mark.parametrize("call", CALLS)
 def test_an_example_runs(call: str, tmp_path: Path) -> None:
     script, *arguments = call.split()
-    printed = _run(str(EXAMPLES / script), *arguments, "--steps", "300", cwd=tmp_path)
+    length = () if "--minutes" in arguments else ("--steps", "300")
+    printed = _run(str(EXAMPLES / script), *arguments, *length, cwd=tmp_path)
     assert CALLS[call] in printed
+
+
+def test_a_policy_from_pixels_is_one_of_stable_baselines3(tmp_path: Path) -> None:
+    """It is loaded without the example, and goes on to learn from rewards."""
+    script = str(EXAMPLES / "reach_from_pixels.py")
+    _run(*f"{script} --minutes 0.02 --arms 2 --evaluate 1 --out a.zip".split(), cwd=tmp_path)
+    model = PPO.load(tmp_path / "a.zip", device="cpu")
+    camera = model.policy_kwargs["features_extractor_kwargs"]["camera"]
+    arms = MaraVectorEnv(
+        2,
+        "MARAReach-v0",
+        observation="joints+pixels",
+        pixel_camera=camera,
+        pixel_channels=["rgb", "depth"],
+        autoreset_mode="SameStep",
+    )
+    env = MaraVecEnv(arms)
+    actions, _ = model.predict(env.reset(), deterministic=True)  # type: ignore[arg-type] # a dictionary
+    assert actions.shape == (2, 6)
+    assert np.ptp(actions, axis=0).max() > 0.0, "what it sees matters"
+    model.set_env(env)
+    model.learn(8)
+    env.close()
 
 
 def test_a_library_that_is_too_old_is_named_with_the_version_wanted(
