@@ -16,9 +16,8 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import environment, environment_id
 from gym_mara.rendering import RenderSettings
+from gym_mara.rendering.settings import PIXELS, STATE
 
-PIXELS, STATE = "pixels", "state"
-"""The keys of the pictures, and of an observation that is no dictionary beside them, as in Gymnasium's AddRenderObservation."""
 LOWEST_PIXELS, MOST_PIXELS = 32, 512
 """The range of the width and height of pictures: Minari takes no smaller array for a picture."""
 

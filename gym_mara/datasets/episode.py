@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gym_mara.datasets.contents import PIXELS, STATE
 from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.view import view_of
 from gym_mara.rendering import Pictures
+from gym_mara.rendering.settings import PIXELS, STATE
 from gym_mara.rendering.view import View
 from gym_mara.types import Floats, Mask
 

@@ -22,15 +22,15 @@ from gym_mara.envs.sensors import Sensors, check_noise, noise_of
 from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams, check_streams, parameter_seeds
 from gym_mara.errors import GymMaraError, whole_number
-from gym_mara.rendering.settings import JOINTS, STATE
+from gym_mara.rendering.settings import STATE
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
-from gym_mara.tasks.observation import OF_THE_ROBOT, PACE, last_action
+from gym_mara.tasks.observation import PACE, last_action
 from gym_mara.types import Floats, Mask
 
 if TYPE_CHECKING:
-    from gym_mara.rendering.pixels import Pixels
+    from gym_mara.envs.pictured import Pictured
 
 
 class Simulation:
@@ -97,35 +97,19 @@ class Simulation:
         )
         self.form_space: Space[Any] = self.observation.space
         """The space of one arm's observation in the form of `form`, without pictures."""
-        # What is observed beside pictures, and its columns in flat observations; None for everything.
-        self._shown: tuple[Observation, NDArray[np.int64]] | None = None
-        if options.pixels.observation == JOINTS:
-            self._shown = self.observation.only(OF_THE_ROBOT)
-        self.pixels = self._new_pixels(options)
-        """Draws the pictures of observations; None without pictures."""
+        self.pixels: Pictured | None = None
+        """Adds pictures to observations; None without pictures."""
+        if options.pixels.observation != STATE:
+            from gym_mara.envs.pictured import Pictured  # it imports graphics libraries
+
+            self.pixels = Pictured(self)
         # The range of joint targets (J,), rad (m).
         self.target_low, self.target_high = self.actions.target_low, self.actions.target_high
-
-    def _new_pixels(self, options: Options) -> Pixels | None:
-        settings = options.pixels
-        if settings.observation == STATE:
-            return None
-        if self._tensor is not None:
-            raise GymMaraError(
-                f"pictures are NumPy's arrays: leave out arrays={self.backend.arrays!r}, or observation={settings.observation!r}"
-            )
-        from gym_mara.envs.view import first_view
-        from gym_mara.rendering.pixels import Pixels  # it imports graphics libraries
-
-        return Pixels(settings, self.robot, self.num_envs, first_view(self))
 
     @property
     def observation_space(self) -> Space[Any]:
         """The space of one arm's observation in the form of `present`."""
-        if self.pixels is None:
-            return self.form_space
-        own = self.form_space if self._shown is None else self._shown[0].space
-        return self.pixels.space(own)
+        return self.form_space if self.pixels is None else self.pixels.space(self.form_space)
 
     @property
     def goal(self) -> Goal:
@@ -161,9 +145,8 @@ class Simulation:
         self.statistics.clear(chosen)
         self._started = True
         self._began[chosen] = True
-        if self.pixels is not None and self.pixels.random:
-            begun = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-            self.pixels.begin({arm: self.streams[arm].pixels for arm in begun.tolist()})
+        if self.pixels is not None:
+            self.pixels.begin(self, mask)
         state, q = self.backend.state, start
         noise = noise_of(state)
         if noise is not None:
@@ -263,12 +246,7 @@ class Simulation:
         """
         if self.pixels is None:
             return self.form(flat)
-        from gym_mara.envs.view import view_of
-
-        chosen = np.arange(self.num_envs) if arms is None else arms
-        views = [view_of(self, arm) for arm in chosen.tolist()]
-        own = self.form(flat) if self._shown is None else flat[:, self._shown[1]]
-        return self.pixels.present(own, views, chosen)
+        return self.pixels.present(self, flat, arms)
 
     def observed(self, arm: int) -> SimState:
         """The state of an arm's last observation: after a collision, the colliding state, even if the arm was reset."""
@@ -370,7 +348,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
-            "looks": None if self.pixels is None else self.pixels.seeds.copy(),
+            "looks": None if self.pixels is None else self.pixels.save(),
             **self.episodes.save(),
         }
 
@@ -400,7 +378,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": tuple,
             "started": bool,
-            "looks": type(None) if self.pixels is None else self.pixels.seeds,
+            "looks": type(None) if self.pixels is None else self.pixels.save(),
             **self.episodes.save(),
         }
         check_fits("snapshot", snapshot, form | others)
@@ -425,7 +403,7 @@ class Simulation:
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         if self.pixels is not None:
-            self.pixels.seeds = snapshot["looks"].copy()
+            self.pixels.restore(snapshot["looks"])
         self.outcome = None
         self.episodes.restore(snapshot)
 

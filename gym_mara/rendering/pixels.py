@@ -60,11 +60,6 @@ class Pixels:
             self._painter = Painter(*self._made_with)
         return self._painter
 
-    @property
-    def segments(self) -> tuple[str, ...]:
-        """What each number of a segmentation stands for: "nothing", "floor", the links, and the frames "target" and "tool"."""
-        return self.painter.segments
-
     def space(self, own: Space[Any]) -> Space[Any]:
         """The space of one arm's observation, of which `own` is the space without pictures."""
         pictures = self.painter.spaces
