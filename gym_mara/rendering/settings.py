@@ -110,7 +110,8 @@ class PixelSettings:
         one_of("observation", self.observation, OBSERVATIONS)
         if self.observation == STATE:
             for field in fields(self)[1:]:
-                if getattr(self, field.name) != field.default:
+                default: Any = field.default
+                if not np.array_equal(getattr(self, field.name), default):
                     raise GymMaraError(
                         f"{field.name} has no effect without pictures: give observation='state+pixels', 'joints+pixels' "
                         "or 'pixels'"
@@ -131,12 +132,14 @@ class PixelSettings:
             camera = _checked_camera(self.pixel_camera)
             object.__setattr__(self, "pixel_camera", camera)
         channels = self.pixel_channels
-        if isinstance(channels, str) or not channels or len(set(channels)) != len(channels):
+        if not isinstance(channels, (tuple, list)) or not channels:
             raise GymMaraError(
                 f"pixel_channels must be a list of some of {', '.join(CHANNELS)}, not {short(channels)}"
             )
         for channel in channels:
             one_of("pixel_channels", channel, CHANNELS)
+        if len(set(channels)) < len(channels):
+            raise GymMaraError(f"pixel_channels must name each channel once, not {short(channels)}")
         object.__setattr__(self, "pixel_channels", tuple(channels))
         random = _checked_randomisation(self.pixel_randomisation)
         object.__setattr__(self, "pixel_randomisation", random)
