@@ -46,13 +46,13 @@ class Pictured:
 
     @property
     def random(self) -> bool:
-        """Whether each episode looks different."""
+        """Whether each episode has another appearance."""
         return self._pixels.random
 
     @property
     def segments(self) -> tuple[str, ...]:
         """What each number of a segmentation stands for: "nothing", "floor", the links, and the frames "target" and "tool"."""
-        return self._pixels.painter.segments
+        return self._pixels.renderer.segments
 
     def space(self, form: Space[Any]) -> Space[Any]:
         """The space of one arm's observation, of which `form` is the space without pictures."""
@@ -72,7 +72,7 @@ class Pictured:
             self._pixels.begin({arm: simulation.streams[arm].pixels for arm in arms.tolist()})
 
     def save(self) -> NDArray[np.uint64]:
-        """What decides how each arm looks (N,), for a snapshot."""
+        """What decides the appearance of each arm (N,), for a snapshot."""
         return self._pixels.seeds.copy()
 
     def restore(self, saved: NDArray[np.uint64]) -> None:

@@ -348,7 +348,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": copy.deepcopy(self.streams),
             "started": self._started,
-            "looks": None if self.pixels is None else self.pixels.save(),
+            "appearance": None if self.pixels is None else self.pixels.save(),
             **self.episodes.save(),
         }
 
@@ -378,7 +378,7 @@ class Simulation:
             "actions": self.actions.save(),
             "streams": tuple,
             "started": bool,
-            "looks": type(None) if self.pixels is None else self.pixels.save(),
+            "appearance": type(None) if self.pixels is None else self.pixels.save(),
             **self.episodes.save(),
         }
         check_fits("snapshot", snapshot, form | others)
@@ -403,7 +403,7 @@ class Simulation:
         self.streams = copy.deepcopy(snapshot["streams"])
         self._started = snapshot["started"]
         if self.pixels is not None:
-            self.pixels.restore(snapshot["looks"])
+            self.pixels.restore(snapshot["appearance"])
         self.outcome = None
         self.episodes.restore(snapshot)
 

@@ -15,7 +15,7 @@ from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
 
 with needs("pictures as observations", "render", "trimesh", "embreex"):
-    from gym_mara.rendering.casting.painter import Painter
+    from gym_mara.rendering.casting.batch_renderer import BatchRenderer
 
 
 class Pixels:
@@ -37,15 +37,15 @@ class Pixels:
     ) -> None:
         self.settings = settings
         self._made_with = settings, robot, first
-        self._painter: Painter | None = Painter(*self._made_with)
-        self._painter.check(first)
+        self._renderer: BatchRenderer | None = BatchRenderer(*self._made_with)
+        self._renderer.check(first)
         self.seeds: NDArray[np.uint64] = np.zeros(num_envs, np.uint64)
-        """Each decides how an arm looks in its episode (N,)."""
+        """Each decides the appearance of an arm in its episode (N,)."""
         self.random = any((settings.pixel_randomisation or {}).values())
-        """Whether each episode looks different."""
+        """Whether each episode has another appearance."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_painter": None}  # a copy makes its own
+        return vars(self) | {"_renderer": None}  # a copy makes its own
 
     def begin(self, generators: Mapping[int, np.random.Generator]) -> None:
         """Choose how arms look in their next episodes; each index of an arm has its generator."""
@@ -54,15 +54,15 @@ class Pixels:
                 self.seeds[arm] = generator.integers(2**63)
 
     @property
-    def painter(self) -> Painter:
+    def renderer(self) -> BatchRenderer:
         """What draws; each copy and each process has its own."""
-        if self._painter is None:
-            self._painter = Painter(*self._made_with)
-        return self._painter
+        if self._renderer is None:
+            self._renderer = BatchRenderer(*self._made_with)
+        return self._renderer
 
     def space(self, own: Space[Any]) -> Space[Any]:
         """The space of one arm's observation, of which `own` is the space without pictures."""
-        pictures = self.painter.spaces
+        pictures = self.renderer.spaces
         if self.settings.observation == PIXELS:
             return pictures[PIXELS] if list(pictures) == [PIXELS] else Dict(pictures)
         return Dict({**(own.spaces if isinstance(own, Dict) else {STATE: own}), **pictures})
@@ -75,7 +75,7 @@ class Pixels:
             views: of these arms.
             arms: their indices (n,).
         """
-        pictures = self.painter.draw(views, self.seeds[arms] if self.random else None)
+        pictures = self.renderer.draw(views, self.seeds[arms] if self.random else None)
         if self.settings.observation == PIXELS:
             return pictures[PIXELS] if list(pictures) == [PIXELS] else pictures
         return {**(own if isinstance(own, dict) else {STATE: own}), **pictures}

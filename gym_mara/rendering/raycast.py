@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gym_mara.rendering.camera import Camera
+from gym_mara.rendering.casting.appearance import Appearance
 from gym_mara.rendering.casting.caster import Caster
-from gym_mara.rendering.casting.looks import Looks
 from gym_mara.rendering.renderer import Picture, Renderer
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import RenderSettings
@@ -22,5 +22,5 @@ class RaycastRenderer(Renderer):
 
     def render(self, view: View) -> Picture:
         camera, colours = self.camera, np.array([self.scene.colours(view)])
-        looks = Looks.usual(camera.eye[None], camera.at[None], camera.up[None], colours)
-        return self._caster.draw(self.scene.bodies(view)[None], looks).colour[0]
+        appearance = Appearance.usual(camera.eye[None], camera.at[None], camera.up[None], colours)
+        return self._caster.draw(self.scene.bodies(view)[None], appearance).colour[0]

@@ -116,7 +116,7 @@ def test_episodes_look_different_if_they_are_random_and_steps_do_not() -> None:
 def test_many_arms_are_drawn_in_threads_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     env = MaraVectorEnv(20, "MARARandomTarget-v0", **{**ALL, "pixel_randomisation": RANDOM})
     seen, _ = env.reset(seed=0)
-    monkeypatch.setattr("gym_mara.rendering.casting.painter._ARMS_PER_THREAD", 10**6)
+    monkeypatch.setattr("gym_mara.rendering.casting.batch_renderer._ARMS_PER_THREAD", 10**6)
     alone, _ = env.reset(seed=0)
     _equal(seen, alone)
     env.close()

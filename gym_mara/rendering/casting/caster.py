@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.rendering.camera import Camera
-from gym_mara.rendering.casting.looks import Looks
+from gym_mara.rendering.casting.appearance import Appearance
 from gym_mara.rendering.casting.rays import Float32s, Hits, Indices, Int32s
-from gym_mara.rendering.casting.shading import NOTHING, Photo, Seen, Surfaces
+from gym_mara.rendering.casting.shading import NOTHING, PlacedBodies, Seen, Surfaces
 from gym_mara.rendering.scene import Scene
 from gym_mara.types import Floats, Mask
 
@@ -35,7 +35,7 @@ class Drawn(NamedTuple):
 
 
 class _Background(NamedTuple):
-    """What does not move in pictures of K pixels, for each of U looks."""
+    """What does not move in pictures of K pixels, for each of U appearances."""
 
     colour: Float32s
     """RGB in [0, 1], in the shadow of fixed bodies alone (U, K, 3)."""
@@ -79,26 +79,26 @@ class Caster:
         self._most = 0
         self._background: _Background | None = None
 
-    def draw(self, poses: Floats, looks: Looks) -> Drawn:
+    def draw(self, poses: Floats, appearance: Appearance) -> Drawn:
         """Draw N arms.
 
         Args:
             poses: of the bodies of each arm (N, B, 4, 4).
-            looks: the N cameras, lights and colours.
+            appearance: the N cameras, lights and colours.
         """
         size, shape = len(self._points), (len(poses), self._height, self._width)
-        behind, row = self._behind(poses, looks)
+        behind, row = self._behind(poses, appearance)
         colour, depth = behind.colour[row], behind.depth[row]
         part, lit = behind.part[row], behind.lit[row]
         bodies = self._surfaces.bodies.all
-        moving, photo = (
-            Photo(self._surfaces, chosen, poses, looks, self._height)
+        moving, placed = (
+            PlacedBodies(self._surfaces, chosen, poses, appearance, self._height)
             for chosen in (self._moving, bodies)
         )
         arm, pixel, new = self._see_moving(moving, depth)
         depth[arm, pixel], part[arm, pixel] = new.depth, new.part
-        points = photo.rays(arm, self._points[pixel]).at(new.depth)
-        bright = photo.lit(points, arm, new.normal)
+        points = placed.rays(arm, self._points[pixel]).at(new.depth)
+        bright = placed.lit(points, arm, new.normal)
         colour[arm, pixel] = new.colour(bright)
         changed = np.zeros(lit.shape, bool)
         changed[arm, pixel] = True
@@ -110,18 +110,18 @@ class Caster:
         normal[arm, pixel], normal[shadow] = new.normal, behind.normal[fixed]
         edges = _edges(part, lit, normal, changed, shape)
         if len(edges):
-            colour.reshape(-1, 3)[edges] = self._finer(photo, *np.divmod(edges, size))
+            colour.reshape(-1, 3)[edges] = self._finer(placed, *np.divmod(edges, size))
         picture = np.uint8(255.0 * np.clip(colour, 0.0, 1.0) + 0.5)
         return Drawn(picture.reshape(*shape, 3), depth.reshape(shape), part.reshape(shape))
 
-    def _behind(self, poses: Floats, looks: Looks) -> tuple[_Background, Indices]:
+    def _behind(self, poses: Floats, appearance: Appearance) -> tuple[_Background, Indices]:
         """What does not move, for each different look, and which look each of the N arms has (N,)."""
-        own = looks._replace(colours=looks.colours[:, self._fixed_parts])
+        own = appearance._replace(colours=appearance.colours[:, self._fixed_parts])
         keys = [b"".join(values[i].tobytes() for values in own) for i in range(len(poses))]
         new = list(dict.fromkeys(key for key in keys if key not in self._known))
         if new or self._background is None:
-            drawn = self._draw_fixed(poses, looks, [keys.index(key) for key in new])
-            # Some of the arms may be drawn alone, and then all of them: twice as many looks are kept.
+            drawn = self._draw_fixed(poses, appearance, [keys.index(key) for key in new])
+            # Some of the arms may be drawn alone, and then all of them: twice as many appearances are kept.
             self._most = max(self._most, len(keys))
             used = [i for i, key in enumerate(self._known) if key in keys]
             others = [i for i, key in enumerate(self._known) if key not in keys]
@@ -134,28 +134,30 @@ class Caster:
             self._background = drawn
         return self._background, np.array([self._known.index(key) for key in keys])
 
-    def _draw_fixed(self, poses: Floats, looks: Looks, arms: list[int]) -> _Background:
+    def _draw_fixed(self, poses: Floats, appearance: Appearance, arms: list[int]) -> _Background:
         """What does not move in the pictures of some arms."""
-        photo = Photo(self._surfaces, self._fixed, poses[arms], looks.of(arms), self._height)
+        placed = PlacedBodies(
+            self._surfaces, self._fixed, poses[arms], appearance.of(arms), self._height
+        )
         arm = np.repeat(np.arange(len(arms)), len(self._points))
-        rays, seen = photo.see(arm, np.tile(self._points, (len(arms), 1)))
+        rays, seen = placed.see(arm, np.tile(self._points, (len(arms), 1)))
         solid = seen.part != NOTHING
         points = rays.at(np.where(solid, seen.depth, np.float32(0.0)))
-        lit = photo.lit(points, arm, seen.normal) | ~solid
+        lit = placed.lit(points, arm, seen.normal) | ~solid
         colour, dark = seen.colour(lit), seen.dark
         shape = len(arms), self._height, self._width
         edges = _edges(seen.part, lit, seen.normal, np.ones(len(lit), bool), shape)
         if len(edges):
             # Where a shadow falls on an edge later, its pixel is drawn again.
-            fine = self._finer(photo, *np.divmod(edges, len(self._points)))
+            fine = self._finer(placed, *np.divmod(edges, len(self._points)))
             colour[edges] = dark[edges] = fine
         made = (colour, dark, seen.depth, seen.part, seen.normal, lit & solid, points)
         return _Background._make(
             values.reshape(len(arms), len(self._points), *values.shape[1:])
-            for values in (*made, photo.across_light(points, arm))
+            for values in (*made, placed.across_light(points, arm))
         )
 
-    def _see_moving(self, moving: Photo, depth: Float32s) -> tuple[Indices, Indices, Seen]:
+    def _see_moving(self, moving: PlacedBodies, depth: Float32s) -> tuple[Indices, Indices, Seen]:
         """The pixels where moving bodies are, each by its arm and its index in the picture, and what is seen there.
 
         Args:
@@ -189,7 +191,7 @@ class Caster:
         return np.repeat(corner, count) + row * self._width + column
 
     def _shadow(
-        self, moving: Photo, behind: _Background, row: Indices, lit: Mask
+        self, moving: PlacedBodies, behind: _Background, row: Indices, lit: Mask
     ) -> tuple[Indices, Indices]:
         """The pixels, each by its arm and its index, in the shadow of a moving body, of those that show something fixed in the light.
 
@@ -211,15 +213,15 @@ class Caster:
         dark = ~moving.lit(points, arm, normal)
         return arm[dark], pixel[dark]
 
-    def _finer(self, photo: Photo, arm: Indices, pixel: Indices) -> Float32s:
+    def _finer(self, placed: PlacedBodies, arm: Indices, pixel: Indices) -> Float32s:
         """RGB of pixels at edges (R, 3): the means of four rays each."""
         count = len(_EDGE_OFFSETS)
         points = np.concatenate([self._points[pixel] + offset for offset in _EDGE_OFFSETS])
-        rays, seen = photo.see(np.tile(arm, count), points)
+        rays, seen = placed.see(np.tile(arm, count), points)
         solid = np.flatnonzero(seen.part != NOTHING)
         lit = np.ones(len(points), bool)
         at = rays.of(solid)
-        lit[solid] = photo.lit(at.at(seen.depth[solid]), at.arm, seen.normal[solid])
+        lit[solid] = placed.lit(at.at(seen.depth[solid]), at.arm, seen.normal[solid])
         return seen.colour(lit).reshape(count, -1, 3).mean(axis=0)
 
 

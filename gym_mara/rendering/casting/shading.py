@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gym_mara.rendering.camera import SHADOW, SPECULAR, Camera
-from gym_mara.rendering.casting.looks import Looks
+from gym_mara.rendering.casting.appearance import Appearance
 from gym_mara.rendering.casting.rays import (
     Bodies,
     Body,
@@ -73,26 +73,31 @@ class Surfaces:
         self.specular = np.where(self.marker, 0.0, SPECULAR).astype(np.float32)
 
 
-class Photo:
+class PlacedBodies:
     """N arms, or some of their bodies, each with its camera, its lights and its colours.
 
     Args:
         surfaces: of the scene.
         bodies: those that are in the pictures.
         poses: of all bodies of each arm (N, B, 4, 4).
-        looks: the cameras, lights and colours.
+        appearance: the cameras, lights and colours.
         height: of a picture, pixels.
     """
 
     def __init__(
-        self, surfaces: Surfaces, bodies: Sequence[Body], poses: Floats, looks: Looks, height: int
+        self,
+        surfaces: Surfaces,
+        bodies: Sequence[Body],
+        poses: Floats,
+        appearance: Appearance,
+        height: int,
     ) -> None:
         self._surfaces, self.bodies, self._poses = surfaces, bodies, poses
-        self._looks = looks
+        self._appearance = appearance
         corners = boxes(bodies, poses)
-        scale = np.float32(height / 2.0) / looks.tangent
+        scale = np.float32(height / 2.0) / appearance.tangent
         self._scale: Float32s = scale
-        local = np.matmul(corners - looks.eye[:, None, None], looks.axes[:, None])
+        local = np.matmul(corners - appearance.eye[:, None, None], appearance.axes[:, None])
         flat = scale[:, None, None, None] * local[..., :2] / np.maximum(local[..., 2:], _NEAR)
         ends = np.stack([flat.min(axis=2), flat.max(axis=2)], axis=2)
         self.in_picture: Float32s = ends.astype(np.float32)
@@ -100,10 +105,10 @@ class Photo:
         # A box that begins behind the camera may be anywhere in the picture.
         behind = (local[..., 2] < _NEAR).any(axis=2)
         self.in_picture[behind] = [[-np.inf, -np.inf], [np.inf, np.inf]]
-        away = np.eye(3)[np.abs(looks.to_light).argmin(axis=1)]
-        across = np.cross(looks.to_light, away)
+        away = np.eye(3)[np.abs(appearance.to_light).argmin(axis=1)]
+        across = np.cross(appearance.to_light, away)
         across /= np.linalg.norm(across, axis=1, keepdims=True)
-        plane = np.stack([across, np.cross(looks.to_light, across)], axis=2)
+        plane = np.stack([across, np.cross(appearance.to_light, across)], axis=2)
         self._plane = plane.astype(np.float32)
         flat = np.matmul(corners, plane[:, None])
         in_light = np.stack([flat.min(axis=2), flat.max(axis=2)], axis=2)
@@ -114,7 +119,7 @@ class Photo:
         """The rays through points of the pictures (R, 2), pixels from the middle; they advance by 1 m along the camera's axis."""
         ahead = np.ones((len(points), 3), np.float32)
         ahead[:, :2] = points / self._scale[arm, None]
-        return Rays(arm, self._looks.eye[arm], turned(self._looks.axes[arm], ahead))
+        return Rays(arm, self._appearance.eye[arm], turned(self._appearance.axes[arm], ahead))
 
     def cast(self, body: Body, rays: Rays, chosen: Indices, hits: Hits) -> None:
         """Cast some rays at a body, as `gym_mara.rendering.casting.rays.cast`."""
@@ -130,7 +135,7 @@ class Photo:
     def shade(self, rays: Rays, hits: Hits) -> Seen:
         """The colours of what rays have hit, or else of the floor and the background."""
         arm, floor_at = rays.arm, self._surfaces.floor
-        middle, background = self._looks.ground[arm, 0], self._looks.ground[arm, 1]
+        middle, background = self._appearance.ground[arm, 0], self._appearance.ground[arm, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
             to_floor = (floor_at[2] - rays.origin[:, 2]) / rays.direction[:, 2]
         part = np.where(hits.face >= 0, self._surfaces.bodies.part_of_face[hits.face], NOTHING)
@@ -152,16 +157,16 @@ class Photo:
 
     def _reflect(self, rays: Rays, part: Int32s, hits: Hits) -> tuple[Float32s, Float32s, Float32s]:
         """RGB with and without the key light (Blinn-Phong reflection), and the normals, each (R, 3), of parts (R,) that rays have hit."""
-        looks, surfaces, arm = self._looks, self._surfaces, rays.arm
+        appearance, surfaces, arm = self._appearance, self._surfaces, rays.arm
         normal = surfaces.bodies.normals(hits, arm, self._poses)
         ahead = rays.direction / np.linalg.norm(rays.direction, axis=1, keepdims=True)
         towards_eye = -np.vecdot(normal, ahead)
         normal = np.where(towards_eye[:, None] < 0.0, -normal, normal)
-        ambient, key, fill = looks.lights[arm].T
+        ambient, key, fill = appearance.lights[arm].T
         ambient = np.where(surfaces.marker[part], np.float32(0.8), ambient)
-        colour, diffuse = looks.colours[arm, part], surfaces.diffuse[part]
+        colour, diffuse = appearance.colours[arm, part], surfaces.diffuse[part]
         dark = colour * (ambient + diffuse * fill * np.abs(towards_eye))[:, None]
-        to_light = looks.to_light[arm]
+        to_light = appearance.to_light[arm]
         facing = np.maximum(np.vecdot(normal, to_light), 0.0)
         half = to_light - ahead
         half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -174,7 +179,7 @@ class Photo:
         lit = np.ones(len(arm), bool)
         if not lit.size:
             return lit
-        begin, to_light = points + _SURFACE_OFFSET * normal, self._looks.to_light[arm]
+        begin, to_light = points + _SURFACE_OFFSET * normal, self._appearance.to_light[arm]
         flat = self.across_light(points, arm)
         for body, box in zip(self.bodies, self.in_light.swapaxes(0, 1), strict=True):
             chosen = np.flatnonzero(lit & inside(flat, box[arm]))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
 from gym_mara.rendering.camera import VIEW_ANGLE, place_camera
+from gym_mara.rendering.casting.appearance import Appearance
 from gym_mara.rendering.casting.caster import Caster, Drawn
-from gym_mara.rendering.casting.looks import Looks
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import PIXELS, TOOL, PixelSettings, RenderSettings
 from gym_mara.rendering.view import View
@@ -29,7 +29,7 @@ _TOOL_ANGLE = 70.0
 """Its vertical angle of view, deg."""
 
 
-class Painter:
+class BatchRenderer:
     """Draws pictures of many arms at once.
 
     Args:
@@ -105,7 +105,7 @@ class Painter:
 
         Args:
             views: of the arms.
-            seeds: each decides how an arm looks (n,); None for the usual looks.
+            seeds: each decides the appearance of an arm (n,); None for the usual one.
 
         Returns:
             For each channel of the settings the pictures: "pixels", uint8 (n, H, W, 3), RGB; "depth", float32 (n, H, W, 1), m along the
@@ -139,13 +139,13 @@ class Painter:
             )
             up, angle = np.einsum("nij,nj->ni", tool[:, :3, :3], up), _TOOL_ANGLE
         colours = np.broadcast_to(self._colours, (count, *self._colours.shape))
-        looks = Looks.usual(eye, at, up, colours, angle)
+        appearance = Appearance.usual(eye, at, up, colours, angle)
         if generators:
             light, colour = (random.get(name, 0.0) for name in ("light", "colour"))
-            looks = looks.randomised(generators, light, colour, self._marker)
-        return self._cast(poses, looks)
+            appearance = appearance.randomised(generators, light, colour, self._marker)
+        return self._cast(poses, appearance)
 
-    def _cast(self, poses: Floats, looks: Looks) -> Drawn:
+    def _cast(self, poses: Floats, appearance: Appearance) -> Drawn:
         """Draw the arms, many of them in several threads: NumPy and Embree release the interpreter lock for a part of the time."""
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         threads = max(1, min(cores or 1, len(poses) // _ARMS_PER_THREAD))
@@ -153,11 +153,12 @@ class Painter:
         while len(self._casters) < threads:
             self._casters.append(Caster(self._scene, self._camera, width, height))
         if threads == 1:
-            return self._casters[0].draw(poses, looks)
+            return self._casters[0].draw(poses, appearance)
         rows = np.array_split(np.arange(len(poses)), threads)
         with ThreadPoolExecutor(threads) as pool:
             drawn = pool.map(
-                lambda i: self._casters[i].draw(poses[rows[i]], looks.of(rows[i])), range(threads)
+                lambda i: self._casters[i].draw(poses[rows[i]], appearance.of(rows[i])),
+                range(threads),
             )
             return Drawn._make(np.concatenate(values) for values in zip(*drawn, strict=True))
 

@@ -1,4 +1,4 @@
-"""Looks: the cameras, the lights and the colours of N pictures."""
+"""Appearance: the cameras, the lights and the colours of N pictures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gym_mara.types import Floats, Mask
 Float32s = NDArray[np.float32]
 
 
-class Looks(NamedTuple):
+class Appearance(NamedTuple):
     """The camera, the light and the colours of each of N pictures."""
 
     eye: Float32s
@@ -40,14 +40,14 @@ class Looks(NamedTuple):
     ground: Float32s
     """RGB of the middle of the floor and of the background (N, 2, 3), in [0, 1]."""
 
-    def of(self, chosen: Sequence[int] | NDArray[np.int64]) -> Looks:
-        """Some of the looks."""
-        return Looks._make(values[chosen] for values in self)
+    def of(self, chosen: Sequence[int] | NDArray[np.int64]) -> Appearance:
+        """Those of some of the pictures."""
+        return Appearance._make(values[chosen] for values in self)
 
     @classmethod
     def usual(
         cls, eye: Floats, at: Floats, up: Floats, colours: Floats, angle: float = VIEW_ANGLE
-    ) -> Looks:
+    ) -> Appearance:
         """The usual lights for N pictures.
 
         Args:
@@ -74,7 +74,7 @@ class Looks(NamedTuple):
 
     def randomised(
         self, generators: Sequence[np.random.Generator], light: float, colour: float, marker: Mask
-    ) -> Looks:
+    ) -> Appearance:
         """The same cameras with random lights and colours.
 
         Args:
