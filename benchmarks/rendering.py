@@ -19,7 +19,9 @@ ARMS, OBSERVED, PROCESSES = 32, 10, 2
 """The arms of a vector environment, its steps, and how many processes have one each."""
 PIXELS: dict[str, dict[str, Any]] = {
     "camera of the scene": {},
-    "with random appearance": {"pixel_randomisation": {"light": 0.5, "colour": 0.3, "camera": 0.05}},
+    "with random appearance": {
+        "pixel_randomisation": {"light": 0.5, "colour": 0.3, "camera": 0.05}
+    },
     "with depth and segmentation": {"pixel_channels": ["rgb", "depth", "segmentation"]},
     "camera on the tool": {"pixel_camera": "tool"},
 }
