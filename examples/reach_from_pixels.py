@@ -2,7 +2,7 @@
 
 To learn from rewards alone takes too long on a CPU. Here a `MultiInputPolicy` imitates the package's pretrained policy, which knows
 the target. Its layers first learn to act for known targets (DAgger: the teacher corrects the states that the student visits).
-Its convolutions then learn where the target is, from pictures of what the student does.
+Then it learns where the target is, from pictures of what the student does, with the segmentation as labels.
 
     python examples/reach_from_pixels.py --out reacher.zip
 """
@@ -10,6 +10,7 @@ Its convolutions then learn where the target is, from pictures of what the stude
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import time
 from pathlib import Path
@@ -48,14 +49,20 @@ STEPS, SKIPPED = 160, 20
 """Of an episode of the training, and between two pictures of it."""
 KEPT_STATES, KEPT_PICTURES = 250_000, 16_384
 LEARNING_RATE = 2e-3
-MARKER = 0.12
-"""The frame that marks a target is within this distance, m."""
+MARKER, POINTS = 0.1, 24
+"""About the size of the frame that marks a target, m, and how many pixels it is read from."""
+
+
+def layers(*sizes: int) -> nn.Sequential:
+    """Linear layers with ReLU between them."""
+    linear = [nn.Linear(*pair) for pair in itertools.pairwise(sizes)]
+    return nn.Sequential(*[part for one in linear for part in (one, nn.ReLU())][:-1])
 
 
 class Reacher(BaseFeaturesExtractor):
     """What the policy knows: the joints, the tool, and the target, which it sees.
 
-    The convolutions choose pixels. The target is the mean of the points in the world that these show, plus an offset.
+    The convolutions choose pixels that show the target. From the points in the world that these show, a PointNet says where it is.
     """
 
     rays: Tensor
@@ -83,20 +90,30 @@ class Reacher(BaseFeaturesExtractor):
             nn.ReLU(),
             nn.Conv2d(24, 24, 3, 1, 2, 2),
             nn.ReLU(),
-            nn.Conv2d(24, 7, 1),
+            nn.Conv2d(24, 4, 1),
+            nn.PixelShuffle(2),
         )
+        self.of_points = layers(10, 64, 64, 128)
+        self.of_target = layers(256, 128, 64, 3)
 
-    def see(self, state: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The target (N, 3), m, the points that the pixels show (N, 3, H, W), m, and the weight of each (N, H, W)."""
+    def see(self, state: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """The target (N, 3), m, and the logarithm of the share of the target that each pixel shows (N, H x W)."""
         points = (self.eye + depth.permute(0, 3, 1, 2) * self.rays).clamp(-2.0, 2.0)
         away = points - self.tool(state)[..., None, None]
-        away = away / (away.norm(dim=1, keepdim=True) + 0.2)
-        maps = self.convolutions(torch.cat([pixels / 127.5 - 1.0, away], 1))
-        chances = nn.functional.pixel_shuffle(maps[:, :4], 2)
-        weights = chances.flatten(1).softmax(1).view_as(chances)
-        offset = (4.0 * nn.functional.avg_pool2d(weights, 2) * maps[:, 4:]).sum((2, 3))
-        target: Tensor = (weights * points).sum((2, 3)) + 0.1 * offset
-        return target, points, weights[:, 0]
+        colours = pixels / 127.5 - 1.0
+        near = away / (away.norm(dim=1, keepdim=True) + 0.2)
+        shares = self.convolutions(torch.cat([colours, near], 1)).flatten(1).log_softmax(1)
+        chosen, places = shares.topk(POINTS, 1)
+        rows = torch.cat([points, away, colours], 1).flatten(2).mT
+        rows = rows.gather(1, places[..., None].expand(-1, -1, rows.shape[2]))
+        chosen = chosen.detach()[..., None]
+        weights = chosen.softmax(1)
+        centre = (weights * rows[..., :3]).sum(1)
+        places_of = torch.cat([rows[..., :3] - centre[:, None], rows[..., 3:6]], 2) / MARKER
+        sure = (chosen - chosen[:, :1]).clamp(min=-8.0)
+        each = self.of_points(torch.cat([places_of.clamp(-5.0, 5.0), rows[..., 6:], sure], 2))
+        all_points = torch.cat([each.amax(1), (weights * each).sum(1)], 1)
+        return centre + MARKER * self.of_target(all_points), shares
 
     def tool(self, state: Tensor) -> Tensor:
         """The position of the tool (N, 3), m."""
@@ -119,7 +136,7 @@ class Reacher(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
         """The features (N, F) for observations."""
-        seen, *_ = self.see(*(observations[name] for name in PARTS))
+        seen, _ = self.see(*(observations[name] for name in PARTS))
         return self.features(observations["state"], seen)
 
 
@@ -136,15 +153,17 @@ class School:
     """Arms with targets that only the teacher knows, and the student: the policy of `model`."""
 
     def __init__(self, arms: int) -> None:
-        env = make_vector_env(ENV, arms, guide=True, autoreset_mode="SameStep", **OPTIONS)
+        labelled = OPTIONS | {"pixel_channels": ["rgb", "depth", "segmentation"]}
+        env = make_vector_env(ENV, arms, guide=True, autoreset_mode="SameStep", **labelled)
         env.reset(seed=0)
         self.simulation, self.teacher = env.simulation, OnnxPolicy(pretrained_file(ENV))
         self.columns = self.simulation.observation.only(OF_THE_ROBOT)[1]
+        self.label = list(self.simulation.pixels.segments).index("target")
         self.model = PPO(
             "MultiInputPolicy",
-            MaraVecEnv(env),
+            MaraVecEnv(make_vector_env(ENV, 1, autoreset_mode="SameStep", **OPTIONS)),
             n_steps=2,
-            batch_size=2 * arms,
+            batch_size=2,
             policy_kwargs=POLICY,
             device="cpu",
             seed=0,
@@ -216,20 +235,24 @@ class School:
         shown = self.simulation.present(self.flat)
         pixels = torch.tensor(shown["pixels"]).permute(0, 3, 1, 2)
         depth = torch.tensor(shown["depth"])
-        seen, *_ = self.reacher.see(self.state, pixels.float(), depth)
+        is_target = torch.tensor(shown["segmentation"] == self.label).flatten(1)
+        seen, _ = self.reacher.see(self.state, pixels.float(), depth)
         wrong = (seen - self.target).norm(dim=1).median()
         print(f"{100 * over:.0f} %: seen {1000 * wrong:.0f} mm off", end="\r", flush=True)
-        self.keep(self.state, pixels, depth.half(), self.target)
+        self.keep(self.state, pixels, depth.half(), is_target, self.target)
         for _ in range(SKIPPED):
             aims = torch.where(self.half, self.target, seen)
             self.step(self.actions(self.state, aims))
 
-    def seeing(self, state: Tensor, pixels: Tensor, depth: Tensor, target: Tensor) -> Tensor:
-        """How wrong the targets are, and how much weight is not on the frames that mark them."""
-        seen, points, weights = self.reacher.see(state, pixels.float(), depth.float())
-        near = (points - target[..., None, None]).norm(dim=1) < MARKER
-        found = (weights * near).sum((1, 2))[near.flatten(1).any(1)]
-        return 3.0 * (seen - target).norm(dim=1).mean() - found.clamp(min=1e-6).log().mean()
+    def seeing(
+        self, state: Tensor, pixels: Tensor, depth: Tensor, is_target: Tensor, target: Tensor
+    ) -> Tensor:
+        """How wrong the seen targets are, and how surprising the pixels that show them."""
+        seen, shares = self.reacher.see(state, pixels.float(), depth.float())
+        count = is_target.sum(1)
+        surprise = -(shares * is_target).sum(1) / count.clamp(min=1)
+        wrong = (seen - target).norm(dim=1).clamp(max=0.5)
+        return 10.0 * wrong.mean() + 0.3 * surprise[count > 0].mean()
 
 
 def evaluate(model: PPO, episodes: int) -> None:
@@ -241,7 +264,7 @@ def evaluate(model: PPO, episodes: int) -> None:
         def act(observation: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
             with torch.no_grad():
                 tensors, _ = policy.obs_to_tensor(observation)
-                seen, *_ = policy.features_extractor.see(*(tensors[n].float() for n in PARTS))
+                seen, _ = policy.features_extractor.see(*(tensors[n].float() for n in PARTS))
             wrong.append(1000.0 * np.linalg.norm(seen.numpy() - simulation.goal.position, axis=1))
             return model.predict(observation, deterministic=True)[0].astype(np.float64)
 
@@ -272,8 +295,9 @@ def main() -> None:
     weights = nn.ModuleList(actor).parameters()
     school.learn(weights, school.acting, school.play_known, 256, ACTOR_SHARE * seconds)
     school.room = KEPT_PICTURES
-    eye = school.reacher.convolutions.parameters()
-    school.learn(eye, school.seeing, school.play_seen, 32, (1.0 - ACTOR_SHARE) * seconds)
+    seer = [getattr(school.reacher, n) for n in ("convolutions", "of_points", "of_target")]
+    eyes = nn.ModuleList(seer).parameters()
+    school.learn(eyes, school.seeing, school.play_seen, 32, (1.0 - ACTOR_SHARE) * seconds)
     school.model.save(arguments.out)
     print(f"{arguments.out}: trained for {time.process_time() / 60.0:.1f} minutes of CPU time")
     evaluate(PPO.load(arguments.out, device="cpu"), arguments.evaluate)
