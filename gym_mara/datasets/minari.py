@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gym_mara.datasets.contents import Contents
 from gym_mara.datasets.episode import Episode
@@ -19,6 +24,10 @@ with needs("data sets of Minari", "minari"):
     from minari.data_collector.episode_buffer import EpisodeBuffer
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import MinariStorage
+
+
+_ROOM = 1 << 20
+"""What must be left of a disk beside the arrays of an episode, bytes."""
 
 
 class MinariWriter(Writer):
@@ -39,6 +48,8 @@ class MinariWriter(Writer):
                 "and -, and end with a version, such as reach-v0"
             ) from None
         spaces = contents.observation_space, contents.action_space
+        self._folder = folder
+        _find_room(folder, 0)
         self._storage = MinariStorage.new(folder / "data", *spaces, env_spec=contents.spec)
         self._about = {
             "dataset_id": name,
@@ -60,6 +71,7 @@ class MinariWriter(Writer):
             "truncations": episode.truncated,
             "infos": infos,
         }
+        _find_room(self._folder, sum(a.nbytes for a in _leaves(buffer)))
         try:
             self._storage.update_episodes([EpisodeBuffer(**buffer)])
         except RuntimeError as error:  # h5py, which cannot close the file
@@ -67,3 +79,25 @@ class MinariWriter(Writer):
 
     def finish(self) -> None:
         self._storage.update_metadata(self._about)
+
+
+def _find_room(folder: Path, size: int) -> None:
+    """Raise the OSError of a full disk before HDF5 meets it, which ends the process with a segmentation fault.
+
+    Args:
+        folder: on the disk.
+        size: of the arrays that HDF5 will write, bytes.
+    """
+    with tempfile.TemporaryFile(dir=folder, buffering=0) as room:
+        for _ in range(0, size + _ROOM, _ROOM):
+            if room.write(bytes(_ROOM)) < _ROOM:  # what is left of the disk is less
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _leaves(values: Any) -> Iterator[NDArray[Any]]:
+    """The arrays in nested dictionaries."""
+    if isinstance(values, dict):
+        for value in values.values():
+            yield from _leaves(value)
+    elif isinstance(values, np.ndarray):
+        yield values

@@ -42,9 +42,7 @@ class Film:
     def __init__(self, path: Path, rate: float) -> None:
         check_film_path(path)
         self._path, self._pictures = path, 0
-        self._options: dict[str, Any] = {"fps": rate, "codec": "libx264", "macro_block_size": 2}
-        if path.suffix.lower() == ".gif":
-            self._options = {"duration": 1000.0 / rate, "loop": 0}
+        self._rate = rate
 
     def add(self, picture: Picture) -> None:
         """Add a picture (height, width, 3); all pictures must have the same size.
@@ -63,7 +61,13 @@ class Film:
         with ExitStack() as stack:
             self._temporary = stack.enter_context(written_aside(self._path, new=True))
             stack.push(self._check)
-            self._writer: Any = imageio.get_writer(self._temporary, **self._options)
+            self._writer: Any
+            if self._path.suffix.lower() == ".gif":
+                self._writer = _Gif(self._temporary, self._rate)
+            else:
+                self._writer = imageio.get_writer(
+                    self._temporary, fps=self._rate, codec="libx264", macro_block_size=2
+                )
             stack.callback(self._writer.close)
             self._stack = stack.pop_all()
         return self
@@ -90,6 +94,22 @@ class Film:
         return GymMaraError(
             f"{str(self._path)!r} could not be written to its end: is the disk full?"
         )
+
+
+class _Gif:
+    """Writes a GIF file when it is closed. imageio would try again at the end of the process where the disk is full."""
+
+    def __init__(self, file: Path, rate: float) -> None:
+        self._file, self._rate = file, rate
+        self._pictures: list[Image.Image] = []
+
+    def append_data(self, picture: Picture) -> None:
+        self._pictures.append(Image.fromarray(picture))
+
+    def close(self) -> None:
+        first, *others = self._pictures
+        duration = 1000.0 / self._rate
+        first.save(self._file, save_all=True, append_images=others, duration=duration, loop=0)
 
 
 def check_film_path(path: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from gym_mara.agents.evaluation.rollout import Act
 from gym_mara.datasets import formats, playing, recorder, sources
 from gym_mara.datasets.contents import Contents
 from gym_mara.datasets.episode import Episode
+from gym_mara.datasets.formats import FORMATS
 from gym_mara.datasets.playing import record, recording_seeds
 from gym_mara.datasets.recorder import Recorded
 from gym_mara.envs import MaraEnv, MaraGoalEnv
@@ -180,6 +183,25 @@ def test_a_full_disk_leaves_nothing(
     monkeypatch.setattr(Kept, method, full)
     with pytest.raises(GymMaraError, match=r"cannot write '.*new': No space left"):
         record(ik("MARA-v0"), "minari", tmp_path / "new", episodes=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_library_that_cannot_write_ends_with_a_clear_error(tmp_path: Path, form: str) -> None:
+    """HDF5 would end the process with a segmentation fault."""
+    code = (
+        "import resource, sys\n"
+        "from gym_mara.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        f"sys.argv[1:] = 'record --policy ik --env MARAReach-v0 --episodes 9 --format {form} --out full-v0'.split()\n"
+        "main()\n"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
+    )
+    assert answer.returncode == 2, answer.stderr
+    assert answer.stderr.startswith("error: cannot write 'full-v0': ")
+    assert len(answer.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 

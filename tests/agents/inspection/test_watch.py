@@ -290,6 +290,7 @@ def test_a_full_disk_ends_a_film_with_a_clear_error(tmp_path: Path, suffix: str)
     )
     assert str(film) in answer.stdout
     assert len(answer.stdout.splitlines()) == 1
+    assert answer.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
 
