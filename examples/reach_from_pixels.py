@@ -158,7 +158,8 @@ class School:
         env.reset(seed=0)
         self.simulation, self.teacher = env.simulation, OnnxPolicy(pretrained_file(ENV))
         self.columns = self.simulation.observation.only(OF_THE_ROBOT)[1]
-        self.label = list(self.simulation.pixels.segments).index("target")
+        pictured: Any = self.simulation.pixels
+        self.label = pictured.segments.index("target")
         self.model = PPO(
             "MultiInputPolicy",
             MaraVecEnv(make_vector_env(ENV, 1, autoreset_mode="SameStep", **OPTIONS)),

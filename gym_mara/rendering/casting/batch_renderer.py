@@ -151,7 +151,8 @@ class BatchRenderer:
         threads = max(1, min(cores or 1, len(poses) // _ARMS_PER_THREAD))
         height, width = self._settings.sides
         while len(self._casters) < threads:
-            self._casters.append(Caster(self._scene, self._camera, width, height))
+            moves = self._settings.pixel_camera == TOOL
+            self._casters.append(Caster(self._scene, self._camera, width, height, moves=moves))
         if threads == 1:
             return self._casters[0].draw(poses, appearance)
         rows = np.array_split(np.arange(len(poses)), threads)

@@ -63,9 +63,12 @@ class Caster:
         camera: it has the floor.
         width: of a picture, pixels.
         height: of a picture, pixels.
+        moves: whether the camera moves with the arm; what it has seen then is not kept.
     """
 
-    def __init__(self, scene: Scene, camera: Camera, width: int, height: int) -> None:
+    def __init__(
+        self, scene: Scene, camera: Camera, width: int, height: int, *, moves: bool = False
+    ) -> None:
         self._surfaces = Surfaces(scene, camera)
         bodies = self._surfaces.bodies.all
         self._fixed = [body for body in bodies if body.number == 0]
@@ -76,7 +79,7 @@ class Caster:
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
         self._points = (pixels - (np.array([width, height]) - 1.0) / 2.0).astype(np.float32)
         self._known: list[bytes] = []
-        self._most = 0
+        self._most, self._moves = 0, moves
         self._background: _Background | None = None
 
     def draw(self, poses: Floats, appearance: Appearance) -> Drawn:
@@ -125,7 +128,7 @@ class Caster:
             self._most = max(self._most, len(keys))
             used = [i for i, key in enumerate(self._known) if key in keys]
             others = [i for i, key in enumerate(self._known) if key not in keys]
-            room = max(2 * self._most - len(used) - len(new), 0)
+            room = 0 if self._moves else max(2 * self._most - len(used) - len(new), 0)
             kept = [*others[len(others) - min(room, len(others)) :], *used]
             if self._background is not None:
                 pairs = zip(self._background, drawn, strict=True)
