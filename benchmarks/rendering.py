@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import time
 from typing import Any
@@ -93,6 +94,7 @@ def cost_of_not_rendering() -> float:
 
 def main() -> None:
     """Print the tables."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print("| 640 × 480 | MARA, ms | UR5, ms | goal for MARA, ms |")
     print("|---|---|---|---|")
     for renderer in RENDERERS:

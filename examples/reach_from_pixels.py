@@ -99,21 +99,25 @@ class Reacher(BaseFeaturesExtractor):
     def see(self, state: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """The target (N, 3), m, and the logarithm of the share of the target that each pixel shows (N, H x W)."""
         points = (self.eye + depth.permute(0, 3, 1, 2) * self.rays).clamp(-2.0, 2.0)
-        away = points - self.tool(state)[..., None, None]
-        colours = pixels / 127.5 - 1.0
-        near = away / (away.norm(dim=1, keepdim=True) + 0.2)
-        shares = self.convolutions(torch.cat([colours, near], 1)).flatten(1).log_softmax(1)
+        from_tool, colours = points - self.tool(state)[..., None, None], pixels / 127.5 - 1.0
+        bounded = from_tool / (from_tool.norm(dim=1, keepdim=True) + 0.2)
+        shares = self.convolutions(torch.cat([colours, bounded], 1)).flatten(1).log_softmax(1)
         chosen, places = shares.topk(POINTS, 1)
-        rows = torch.cat([points, away, colours], 1).flatten(2).mT
-        rows = rows.gather(1, places[..., None].expand(-1, -1, rows.shape[2]))
-        chosen = chosen.detach()[..., None]
-        weights = chosen.softmax(1)
-        centre = (weights * rows[..., :3]).sum(1)
-        places_of = torch.cat([rows[..., :3] - centre[:, None], rows[..., 3:6]], 2) / MARKER
-        sure = (chosen - chosen[:, :1]).clamp(min=-8.0)
-        each = self.of_points(torch.cat([places_of.clamp(-5.0, 5.0), rows[..., 6:], sure], 2))
-        all_points = torch.cat([each.amax(1), (weights * each).sum(1)], 1)
-        return centre + MARKER * self.of_target(all_points), shares
+        shown = torch.cat([points, from_tool, colours], 1).flatten(2).mT
+        shown = shown.gather(1, places[..., None].expand(-1, -1, shown.shape[2]))
+        parts = shown[..., :3], shown[..., 3:6], shown[..., 6:]
+        return self.locate(*parts, chosen.detach()), shares
+
+    def locate(self, points: Tensor, from_tool: Tensor, colours: Tensor, shares: Tensor) -> Tensor:
+        """The target (N, 3), m, from P points in the world, their ways from the tool, their colours (N, P, 3) and their shares (N, P)."""
+        weights = shares.softmax(1)[..., None]
+        centre = (weights * points).sum(1)
+        ways = torch.cat([points - centre[:, None], from_tool], 2) / MARKER
+        sure = (shares - shares[:, :1]).clamp(min=-8.0)[..., None]
+        each = self.of_points(torch.cat([ways.clamp(-5.0, 5.0), colours, sure], 2))
+        together = torch.cat([each.amax(1), (weights * each).sum(1)], 1)
+        target: Tensor = centre + MARKER * self.of_target(together)
+        return target
 
     def tool(self, state: Tensor) -> Tensor:
         """The position of the tool (N, 3), m."""

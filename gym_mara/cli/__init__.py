@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import Any
 
 FAILED = 2
 """The exit code of a command that cannot do its work; 1 is for a check that found a difference."""
@@ -75,9 +76,17 @@ def _output_failed(error: OSError) -> int:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print a warning as one line, without its place in the code."""
-    before = warnings.formatwarning
-    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    """Print each warning once, as one line, without its place in the code."""
+    before, shown = warnings.formatwarning, set[str]()
+
+    def once(message: Warning | str, *_: Any, **__: Any) -> str:
+        text = f"warning: {message}\n"
+        if text in shown:
+            return ""
+        shown.add(text)
+        return text
+
+    warnings.formatwarning = once
     try:
         yield
     finally:

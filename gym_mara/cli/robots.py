@@ -174,7 +174,7 @@ def _write_srdf(arm: RobotModel, file: Path) -> None:
 
 def _draw(arm: RobotModel, target: dict[str, Any], file: Path) -> None:
     with written_aside(file, new=True) as temporary:
-        with needs("pictures", "render", "imageio"):
+        with needs("a picture", "render", "imageio"):
             import imageio.v2 as imageio
 
         view = View(arm.home, np.array(target["position"]), np.array(target["quaternion"]))

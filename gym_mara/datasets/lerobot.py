@@ -26,7 +26,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.files import write_json
 
-with needs("data sets of LeRobot", "lerobot"):
+with needs("a data set of LeRobot", "lerobot"):
     import pandas
     import pyarrow
 

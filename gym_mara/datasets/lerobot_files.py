@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gym_mara.extras import needs
 
-with needs("data sets of LeRobot", "lerobot"):
+with needs("a data set of LeRobot", "lerobot"):
     import imageio_ffmpeg
     import pyarrow.parquet
 

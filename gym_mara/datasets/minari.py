@@ -18,7 +18,7 @@ from gym_mara.datasets.formats import Writer
 from gym_mara.errors import GymMaraError, short
 from gym_mara.extras import needs
 
-with needs("data sets of Minari", "minari"):
+with needs("a data set of Minari", "minari"):
     import h5py  # noqa: F401 - Minari imports it when it writes
     import minari
     from minari.data_collector.episode_buffer import EpisodeBuffer

@@ -15,7 +15,7 @@ from gym_mara.extras import needs
 from gym_mara.files import written_aside
 from gym_mara.rendering.renderer import Picture
 
-with needs("films", "render", "imageio", "imageio-ffmpeg", "pillow"):
+with needs("a film", "render", "imageio", "imageio-ffmpeg", "pillow"):
     import imageio.v2 as imageio
     import imageio_ffmpeg
     from PIL import Image, ImageDraw, ImageFont

@@ -14,7 +14,7 @@ from gym_mara.rendering.settings import PIXELS, STATE, PixelSettings
 from gym_mara.rendering.view import View
 from gym_mara.robot import RobotModel
 
-with needs("pictures as observations", "render", "trimesh", "embreex"):
+with needs("a picture as an observation", "render", "trimesh", "embreex"):
     from gym_mara.rendering.casting.batch_renderer import BatchRenderer
 
 

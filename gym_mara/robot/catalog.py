@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +25,10 @@ class RobotFiles(NamedTuple):
 
 
 def _robots_dir() -> Path:
-    return Path(str(resources.files("gym_mara.robots")))
+    """Inside the package where it is installed, and beside it in a checkout, also if another one is installed."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "robots"
+    return installed if installed.is_dir() else package.parent / "robots"
 
 
 def own_robots() -> dict[str, RobotFiles]:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from gym_mara.ros2.link import RosLink
     from gym_mara.ros2.node import RosNode
 
+RESUME = "/gym_mara/resume"
+"""The service with which an operator lets a stopped arm move again."""
 _WINDOW = 1000
 """Over how many of the last actions their lateness is measured."""
 _WAIT = 0.05
@@ -165,6 +167,8 @@ class Deployment:
         else:
             with self._lock:
                 self._next = asked
+            if self._stopped:
+                self._log(f"the target is kept: the arm moves to it once {RESUME} is called")
 
     def check(self, target: Target) -> None:
         """Check a target.
@@ -229,7 +233,7 @@ class Deployment:
         status, _ = self._status
         if status != self._told:
             self._told = status
-            self._log(status)
+            self._log(f"{status}; call {RESUME} to go on" if self._stopped else status)
 
     def _wait(self) -> None:
         self._clock.sleep_until(self._clock.now() + _WAIT)
@@ -293,12 +297,18 @@ class Deployment:
         return () if setpoint is None else tuple(setpoint.q.tolist())
 
     @property
+    def _stopped(self) -> bool:
+        """Whether the safety filter holds the arm, or brings it to rest, until it is resumed."""
+        held = self._driver.safety.mode in (Mode.STOPPING, Mode.STOPPED)
+        return held and self._driver.failure is None
+
+    @property
     def _status(self) -> tuple[str, bool]:
         """What the arm does, and whether that is trouble."""
         safety, failure = self._driver.safety, self._driver.failure
         if failure is not None:
             return f"failed: {failure}", True
-        if safety.mode in (Mode.STOPPING, Mode.STOPPED):
+        if self._stopped:
             return f"stopped: {safety.reason}", True
         state = self._driver.link.state
         age = np.inf if state is None else self._clock.now() - state.received

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers, one_of
 from gym_mara.ros2 import messages
-from gym_mara.ros2.deploy import Deployment, Target
+from gym_mara.ros2.deploy import RESUME, Deployment, Target
 from gym_mara.ros2.diagnostics import Diagnostics
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.tasks.reach import check_unit
@@ -20,7 +20,7 @@ with needs_ros("a deployment"):
     from geometry_msgs.msg import PoseStamped
     from std_srvs.srv import Trigger
 
-TARGET, STOP, RESUME = "/gym_mara/target", "/gym_mara/stop", "/gym_mara/resume"
+TARGET, STOP = "/gym_mara/target", "/gym_mara/stop"
 DIAGNOSTICS = "/diagnostics"
 _EVERY = 1.0
 """How often diagnostics are published, s."""

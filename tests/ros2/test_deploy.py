@@ -121,10 +121,12 @@ def test_a_stop_is_latched_until_the_operator_resumes(deploy: Callable[..., Depl
     deployment.run(5.0)
     np.testing.assert_array_equal(_arm(deployment).q, stopped)
     assert _error(deployment, NEAR) > 0.01
+    deployment.aim(NEAR).result()
+    assert notes[-1] == "the target is kept: the arm moves to it once /gym_mara/resume is called"
     deployment.resume()
     deployment.run(8.0)
     assert _error(deployment, NEAR) < 1e-4
-    assert "stopped: somebody asked" in notes
+    assert "stopped: somebody asked; call /gym_mara/resume to go on" in notes
 
 
 def test_a_stop_is_seen_while_it_waits_for_a_target(deploy: Callable[..., Deployment]) -> None:
@@ -135,7 +137,7 @@ def test_a_stop_is_seen_while_it_waits_for_a_target(deploy: Callable[..., Deploy
     deployment.run(1.0)
     found = deployment.diagnostics
     assert (found.status, found.in_trouble) == ("stopped: somebody asked", True)
-    assert "stopped: somebody asked" in notes
+    assert "stopped: somebody asked; call /gym_mara/resume to go on" in notes
     deployment.resume()
     deployment.aim(NEAR).result()
     deployment.run(8.0)

@@ -93,8 +93,8 @@ def deploy(
         "live": live,
     }
     with _exported(policy, env) as exported:
-        from gym_mara.ros2.deploy import Deployment
-        from gym_mara.ros2.deploy_node import RESUME, STOP, TARGET, DeployNode
+        from gym_mara.ros2.deploy import RESUME, Deployment
+        from gym_mara.ros2.deploy_node import STOP, TARGET, DeployNode
         from gym_mara.ros2.safety.filter import NO_EMERGENCY_STOP
 
         out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)

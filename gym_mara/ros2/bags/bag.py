@@ -15,7 +15,7 @@ from gym_mara.errors import GymMaraError
 from gym_mara.extras import needs
 from gym_mara.files import DamagedFileError, MissingFileError, plain_size, read_bytes, read_text
 
-with needs("bags", "ros2", "rosbags"):
+with needs("a bag", "ros2", "rosbags"):
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
