@@ -38,6 +38,7 @@ CAMERA = [[-1.87, -1.0, 3.68], [0.0, 0.0, 1.15]]
 OPTIONS: dict[str, Any] = {
     "observation": "joints+pixels",
     "pixel_camera": CAMERA,
+    "pixel_size": 112,
     "pixel_channels": ["rgb", "depth"],
     "max_joint_velocity": 1.57,
     "servo_gain": 10,
@@ -49,7 +50,7 @@ STEPS, SKIPPED = 160, 20
 """Of an episode of the training, and between two pictures of it."""
 KEPT_STATES, KEPT_PICTURES = 250_000, 16_384
 LEARNING_RATE = 2e-3
-MARKER, POINTS = 0.1, 24
+MARKER, POINTS = 0.1, 40
 """About the size of the frame that marks a target, m, and how many pixels it is read from."""
 
 

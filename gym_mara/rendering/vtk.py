@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +38,11 @@ with needs("the renderer 'vtk'", "render", "pyvista"):
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkObject, vtkUnsignedCharArray
     from vtkmodules.vtkCommonDataModel import vtkPlane
+
+with suppress(ImportError):
+    # OpenGL in software (Mesa) and Triton, which comes with torch for CUDA, have an LLVM each. Where Triton's comes second, as at the
+    # first optimiser that torch makes after a picture, the process crashes.
+    importlib.import_module("triton")
 
 _SAMPLES = 4
 _process: int | None = None

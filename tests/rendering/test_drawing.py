@@ -82,6 +82,18 @@ def test_two_threads_draw_the_first_picture_of_a_process(renderer: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
+def test_the_llvm_of_torch_is_loaded_before_that_of_opengl(tmp_path: Path) -> None:
+    """The other way round a process with torch for CUDA crashes; here a module stands in for Triton."""
+    (tmp_path / "triton.py").write_text(
+        "import sys; print('vtkmodules.vtkRenderingOpenGL2' in sys.modules)"
+    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import gym_mara.rendering.vtk"
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout == "False\n"
+
+
 @pytest.mark.parametrize("copy", COPIES)
 def test_a_copy_draws_with_a_renderer_of_its_own(renderer: str, copy: Any) -> None:
     before = drawing_thread().live_renderers
