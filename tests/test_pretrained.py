@@ -104,7 +104,7 @@ def test_an_exported_policy_is_watched_in_its_own_environment_or_another(
     assert [env for env, *_ in watched] == ["MARAReach-v0"] * 2
     code, _, error = gym_mara("watch", "--policy", file, "--env", "MARAPose-v0")
     assert code == 2
-    assert "the policy does not fit the environment: it observes" in error
+    assert "the policy of MARAReach-v0 does not fit the environment: it observes" in error
 
 
 @pytest.mark.parametrize(

@@ -100,11 +100,11 @@ def check_fits(about: About, simulation: Any) -> None:
     ):
         if ours != theirs:
             raise GymMaraError(
-                f"the policy does not fit the environment: it {what} {ours}, and the environment has {theirs}"
+                f"the policy of {about.env} does not fit the environment: it {what} {ours}, and the environment has {theirs}"
             )
     if about.robot.fingerprint != there.robot.fingerprint:
         raise GymMaraError(
-            f"the policy does not fit the environment: it was trained for another robot, {about.robot.name!r}, with the same "
+            f"the policy of {about.env} does not fit the environment: it was trained for another robot, {about.robot.name!r}, with the same "
             "joints' names: make the environment with the robot of the training, or export a policy of this one"
         )
 

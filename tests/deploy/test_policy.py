@@ -340,12 +340,13 @@ def test_the_example_of_the_page_moves_a_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    first, loop = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
     policy(tmp_path, FROM_TARGET)  # writes policy.onnx
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     robot = FakeRobot()
-    exec(example, {"robot": robot, "goal": np.zeros(1)})
+    exec(first, {})
+    exec(loop, {"robot": robot, "goal": np.zeros(1)})
     assert robot.periods == 6
     assert (robot.q > 0.0).all()
 
