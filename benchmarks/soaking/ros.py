@@ -61,8 +61,9 @@ def live(seed: int, tally: Tally) -> None:
             env.reset(seed=seed, options={"start_q": home})
             for _ in range(round(SECONDS / _PERIOD)):
                 step(env, env.action_space.sample(), tally)
-        except ArmStoppedError:
+        except ArmStoppedError as error:
             tally.done["stops"] += 1
+            print(f"round {seed + 1}: {error}", file=sys.stderr, flush=True)
 
 
 def deployment(seed: int, tally: Tally, *, policy: OnnxPolicy) -> None:
