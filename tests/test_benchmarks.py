@@ -1,14 +1,19 @@
-"""The benchmark for a GPU runs on the CPU too, where its figures mean nothing, and says where there is no GPU."""
+"""The benchmark for a GPU runs on the CPU too, where its figures mean nothing, and says where there is no GPU; the soak finds faults."""
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box, Dict
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "gpu.py"
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SCRIPT = BENCHMARKS / "gpu.py"
 
 
 def _done(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -40,3 +45,42 @@ def test_without_a_gpu_it_says_so() -> None:
     assert done.returncode == 1
     assert "finds no GPU" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.fixture
+def soaking(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
+    """The parts of the soak by their names."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    names = ("tally", "environments", "written")
+    return {name: importlib.import_module(f"soaking.{name}") for name in names}
+
+
+def test_the_soak_finds_what_is_wrong(soaking: dict[str, ModuleType]) -> None:
+    space = Dict({"state": Box(-1.0, 1.0, (2,)), "seen": Dict({"depth": Box(0.0, 9.0, (1,))})})
+
+    def wrong(state: float = 0.0, depth: float = 1.0, reward: float = 0.0) -> dict[str, int]:
+        tally = soaking["tally"].Tally()
+        parts = {"state": np.full(2, state, np.float32)}
+        seen = {**parts, "seen": {"depth": np.full(1, depth, np.float32)}}
+        tally.observe(space, seen, np.array([reward]))
+        tally.compare([np.zeros(2)], [np.full(2, state)])
+        assert (tally.done["steps"], tally.done["comparisons"]) == (1, 1)
+        return dict(+tally.wrong)
+
+    assert wrong() == {}
+    assert wrong(reward=np.nan) == {"NaN": 1}
+    assert wrong(depth=np.nan) == {"NaN": 1, "outside the space": 1}
+    assert wrong(depth=-1.0) == {"outside the space": 1}
+    assert wrong(state=0.5) == {"other result": 1}
+
+
+def test_scenarios_of_the_soak_find_nothing_wrong(soaking: dict[str, ModuleType]) -> None:
+    tally, options = soaking["tally"].Tally(), {"backend": "pinocchio", "pixel_size": 16}
+    seen = {"observation": "state+pixels", "pixel_channels": ["depth"], **options}
+    soaking["environments"].observed_pictures(0, tally, name="MARAReach-v0", **seen)
+    soaking["environments"].single(0, tally, name="MARAGoal-v0", backend="pinocchio")
+    soaking["written"].recordings(0, tally, form="lerobot", episodes=1, pixels=None)
+    assert +tally.wrong == {}
+    assert tally.done["comparisons"] == 3
+    assert tally.done["pictures"] > 900
+    assert tally.done["files"] == 2

@@ -11,11 +11,11 @@ import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import numpy as np
 import pytest
 import typer
 
@@ -25,12 +25,20 @@ from gym_mara.agents.experiments.grid import Grid, run_grid
 from gym_mara.agents.export.run import export
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.training.train import train
+from gym_mara.backends import backend_names, backend_settings
 from gym_mara.cli.app import app
-from gym_mara.identification import Log
+from gym_mara.envs import task_keywords
+from gym_mara.envs.actions import ActionSettings
+from gym_mara.envs.goal import GoalSettings
+from gym_mara.envs.sensors import SensorSettings
+from gym_mara.registration import ENVIRONMENTS
+from gym_mara.rendering import PixelSettings, RenderSettings
 from gym_mara.robot import RobotModel
+from gym_mara.robot.options import ROBOT_KEYWORDS
 from gym_mara.ros2.bags.logs import write_episode
 from gym_mara.tasks import TASKS
 from tests.cli_worker import Ended, Worker
+from tests.identification.arms import hidden, log_of
 
 NUMBERS = [
     *(
@@ -96,33 +104,28 @@ VALUES = [
         "fifo",
     ),
 ]
-KEYWORDS = [
+STRANGE = [
     *("num_envs", "max_episode_steps", "autoreset_mode", "task", "backend", "self", "render_mode"),
-    *("robot", "ee_frame", "kappa", "alpha", "target_position", "target_quaternion", "start_q"),
-    *("on_collision", "orientation", "collision", "collision_threads", "max_joint_velocity"),
-    *(
-        "control_period",
-        "path_resolution",
-        "physics_step",
-        "servo_gain",
-        "randomisation",
-        "detector",
-    ),
-    *(
-        "workers",
-        "velocity_filter",
-        "width",
-        "height",
-        "camera",
-        "renderer",
-        "viewer_port",
-        "viewer_host",
-    ),
-    *("default_mass", "effort_limit", "velocity_limit", "package_dirs", "convex_hulls"),
-    *("threads", "dynamics", "arrays", "device", "max_contacts"),
     *("robt", "", "1", "a b", "__class__", "options"),
 ]
-SETTINGS = ["kappa=0.5", "max_joint_velocity=1", "robot=ur5", "on_collision=terminate", "robt=mara"]
+"""Keyword arguments that --set does not take."""
+PICTURED = {
+    "observation": ["pixels", "joints+pixels"],
+    "pixel_size": ["32", "[24, 32]"],
+    "pixel_camera": ["tool", "top", "[[2, 0, 1], [0, 0, 1]]"],
+    "pixel_channels": ['["depth"]', '["rgb", "depth", "segmentation"]'],
+    "pixel_randomisation": ['{"light": 0.5}', '{"camera": 0.1, "colour": 1}'],
+}
+"""Keyword arguments of pictures in observations, with values that they take."""
+SETTINGS = [
+    *("kappa=0.5", "max_joint_velocity=1", "robot=ur5", "on_collision=terminate", "robt=mara"),
+    *(
+        "action=relative",
+        "action=cartesian",
+        "servo_gain=10",
+        'randomisation={"latency": [0, 0.1]}',
+    ),
+]
 VALID: dict[str, Sequence[str]] = {
     "env": [*TASKS, "gym_mara/MARA-v0"],
     "algo": list(ALGORITHMS),
@@ -169,6 +172,10 @@ VALID: dict[str, Sequence[str]] = {
     "control_period": ["0.02"],
     "rate": ["10"],
     "as_json": ["new.json"],
+    "identify.bag": ["bag"],
+    "parameters": ["joint_friction", "latency", "mass,mass"],
+    "period": ["0.02", "0.02", "0.1"],
+    "log": ["csv", "csv,tensorboard", "wandb"],
     "ros2 check.policy": ["policy.onnx"],
     "ros2 check.seconds": ["0.5"],
     "ros2 deploy.policy": ["policy.onnx", "pretrained", "run"],
@@ -178,6 +185,7 @@ VALID: dict[str, Sequence[str]] = {
 }
 """Values of a parameter by its name, or by those of the command and the parameter."""
 FORCED = {
+    "identify": ["parameters"],
     "record": ["policy", "out_folder", "episodes"],
     "train": ["steps"],
     "benchmark": ["env", "algo", "steps", "seeds", "out_folder"],
@@ -189,7 +197,7 @@ FORCED = {
     "ros2 sim": ["seconds"],
 }
 """Options without which a call would take long, do nothing, or would not end."""
-RARE = ("report", "search", "benchmark")
+RARE = ("report", "search", "benchmark", "identify")
 """Commands that take seconds even with the smallest numbers."""
 
 
@@ -203,6 +211,21 @@ def _commands(group: Any, before: str = "") -> dict[str, Any]:
 
 
 COMMANDS = _commands(typer.main.get_command(app))
+
+
+def _keywords() -> list[str]:
+    """Every keyword argument of the environments and the backends, and some that are none."""
+    found = {*ROBOT_KEYWORDS}
+    for backend in backend_names():
+        found |= {*backend_settings(backend)}
+    for name in ENVIRONMENTS:
+        found |= {*task_keywords(name)}
+    for settings in (ActionSettings, GoalSettings, PixelSettings, RenderSettings, SensorSettings):
+        found |= {field.name for field in fields(settings)}
+    return [*sorted(found), *STRANGE]
+
+
+KEYWORDS = _keywords()
 
 
 def arguments_of(choose: random.Random) -> list[str]:
@@ -224,10 +247,19 @@ def arguments_of(choose: random.Random) -> list[str]:
                 call.append(_value(name, parameter, choose, hostile))
     if "--resume" in call and choose.random() < 0.7:
         call = ["train", "--resume", call[call.index("--resume") + 1]]
+    if any(parameter.name == "settings" for parameter in COMMANDS[name].params):
+        call += _pictured(choose) if choose.random() < 0.15 else []
     if "--video" in call:
         call += ["--set", "width=64", "--set", "height=48"]
         call += [] if "--targets" in call else ["--seconds", "0.1"]
     return call
+
+
+def _pictured(choose: random.Random) -> list[str]:
+    """Options for pictures as observations, with one value that may be hostile."""
+    name = choose.choice(list(PICTURED))
+    value = choose.choice(PICTURED[name] if choose.random() < 0.6 else VALUES)
+    return ["--set", "observation=state+pixels", "--set", f"{name}={value}"]
 
 
 def _value(command: str, parameter: Any, choose: random.Random, hostile: float) -> str:
@@ -263,8 +295,8 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run_grid(folder / "grid", grid, run_here, lambda name, message: None) == {}
     regression.write(folder / "record.csv", regression.record("MARA-v0", "pinocchio", {}, 8))
     robot = RobotModel.load("mara")
-    q = np.tile(robot.home, (25, 1))
-    log = Log(np.arange(25) * np.float64(0.1), q, q, np.zeros_like(q), robot.joint_names)
+    friction = hidden(robot, 1, (0, 1), ("joint_friction",))
+    log = log_of(robot, "mujoco", friction, 2.0, (0, 1))
     write_episode(folder / "bag", log, robot)
     return folder
 

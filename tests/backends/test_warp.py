@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -59,6 +60,18 @@ def test_it_falls_as_pinocchio_says(mara: RobotModel) -> None:
             velocity += step * pin.aba(mara.model, data, position, velocity, none)
             position += step * velocity
         np.testing.assert_allclose(states[-1].q[arm], position, rtol=0.0, atol=2e-4)
+
+
+def test_arms_in_several_threads_do_not_disturb_each_other(mara: RobotModel) -> None:
+    def states(_: int) -> list[SimState]:
+        backend = _warp(mara, 2, dynamics=False)
+        return [backend.step(q) for q in np.split(uniform_q(mara, 8, seed=1), 4)]
+
+    with ThreadPoolExecutor(3) as threads:
+        first, *others = threads.map(states, range(3))
+    for other in others:
+        for one, same in zip(first, other, strict=True):
+            assert_same_state(one, same)
 
 
 def test_links_touch_where_coal_says_but_within_a_millimetre(mara: RobotModel) -> None:

@@ -16,8 +16,8 @@ import optuna
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, is_schedule
-from gym_mara.agents.algorithms.registry import algorithm
+from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, Values, is_schedule
+from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
 from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS
 from gym_mara.agents.experiments.local_executor import run_in_processes
@@ -228,14 +228,43 @@ def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
 
 def _suggested(search: Search, trial: optuna.Trial) -> Preset:
     """The preset of a trial, with the values that the sampler suggests."""
-    space = algorithm(search.algo).search_space
+    start = preset_of(search.config(FIRST_SEED))
+    space = space_around(start, search.algo)
     chosen = {
         name: trial.suggest_float(name, *values, log=True)
         if isinstance(values, LogRange)
         else trial.suggest_categorical(name, values)
         for name, values in {**space.arguments, **space.policy_kwargs}.items()
     }
-    return with_values(preset_of(search.config(FIRST_SEED)), space, chosen)
+    return with_values(start, space, chosen)
+
+
+def space_around(start: Preset, algo: str) -> SearchSpace:
+    """The search space of an algorithm around the preset with which a search starts.
+
+    A range that does not contain the value of the preset is moved there, and a list gets it. If the preset has a policy of another
+    form than the space is for, only those hyperparameters of the policy are varied that the preset has.
+    """
+    entry = algorithm(algo)
+    space = entry.search_space
+    there = values_of(start, space)
+    usual = entry.preset(DEFAULT_PRESET, teleports=True).policy == start.policy
+
+    def around(name: str, values: Values) -> Values:
+        if name not in there:
+            return values
+        value = there[name]
+        if not isinstance(values, LogRange):
+            return values if value in values else [*values, value]
+        if values.low <= value <= values.high:
+            return values
+        half = math.sqrt(values.high / values.low)
+        return LogRange(value / half, value * half)
+
+    return SearchSpace(
+        {name: around(name, values) for name, values in space.arguments.items()},
+        {n: around(n, v) for n, v in space.policy_kwargs.items() if usual or n in there},
+    )
 
 
 def with_values(preset: Preset, space: SearchSpace, chosen: dict[str, Any]) -> Preset:

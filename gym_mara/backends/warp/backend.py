@@ -233,10 +233,8 @@ class WarpBackend(Backend):
         with self._exchange.scope():
             self._give("q_target", q_target, self._engine.target)
             self._engine.step()
-        self._fresh = True
-        state = self._read()
-        self._check_status()
-        return state
+            self._fresh = True
+            return self._read()
 
     def _give(self, name: str, values: Array, array: Any) -> None:
         """Copy values that a caller gives to an array of the engine."""
@@ -251,16 +249,19 @@ class WarpBackend(Backend):
 
     @property
     def state(self) -> SimState:
-        if not self._fresh:
-            with self._exchange.scope():
+        with self._exchange.scope():
+            if not self._fresh:
                 self._engine.look_at_arms()
-            self._fresh = True
-        state = self._read()
+                self._fresh = True
+            return self._read()
+
+    def _read(self) -> SimState:
+        """The state in the arrays of the engine; an error if something went wrong."""
+        state = self._state_of_engine()
         self._check_status()
         return state
 
-    def _read(self) -> SimState:
-        """The state in the arrays of the engine."""
+    def _state_of_engine(self) -> SimState:
         engine, read = self._engine, self._exchange.read
         truncates = self.dynamic and self.on_divergence == "truncate"
         common: dict[str, Any] = {
@@ -310,8 +311,7 @@ class WarpBackend(Backend):
         status = self._engine.status.numpy()
         if not np.count_nonzero(status):
             return
-        with self._exchange.scope():
-            status = self._engine.take_status()
+        status = self._engine.take_status()
         diverged, without_force, lost = (int(status[i]) for i in (DIVERGED, NO_FORCE, LOST))
         if lost:
             raise GymMaraError(
@@ -323,14 +323,15 @@ class WarpBackend(Backend):
             warnings.warn(
                 f"arm {without_force - 1} had more than max_contacts={self._max_contacts} points of contact, and the rest "
                 "exerted no force; a larger max_contacts takes more memory and time",
-                stacklevel=3,
+                stacklevel=4,
             )
         if diverged and self.on_divergence == "error":
             time = float(self._engine.steps.numpy()[diverged - 1]) * self.control_period
             raise simulation_diverged(diverged - 1, time)
 
     def save(self) -> dict[str, Any]:
-        engine = {name: array.numpy().copy() for name, array in self._engine.state.items()}
+        with self._exchange.scope():
+            engine = {name: array.numpy().copy() for name, array in self._engine.state.items()}
         return engine | {"parameters": copy.deepcopy(self._parameters)}
 
     def restore(self, snapshot: dict[str, Any]) -> None:

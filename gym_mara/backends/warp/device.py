@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +21,8 @@ with needs("the backend 'warp'", "warp"):
 _SCRATCH_OF_CONTACT, _SCRATCH_OF_ROW = 8000, 32
 """What MuJoCo Warp allocates for each contact and each row of constraints while it steps, bytes."""
 _SAMPLE = 16
+WORKING = threading.RLock()
+"""Is held by the thread that works with Warp, which has one current device and one capture for all threads of a process."""
 
 
 def choose_device(name: str | None) -> wp.Device:
@@ -28,7 +31,8 @@ def choose_device(name: str | None) -> wp.Device:
     Raises:
         GymMaraError: the name is unknown, or there is no GPU.
     """
-    gpus = [device.alias for device in wp.get_cuda_devices()]
+    with WORKING:
+        gpus = [device.alias for device in wp.get_cuda_devices()]
     if name is None or (isinstance(name, str) and name.split(":")[0] == "cuda" and not gpus):
         if not gpus:
             raise GymMaraError(

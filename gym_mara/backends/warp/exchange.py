@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gym_mara.backends.warp.device import WORKING
 from gym_mara.extras import needs
 from gym_mara.types import Array
 
@@ -30,8 +31,8 @@ class NumpyExchange:
 
     @contextmanager
     def scope(self) -> Iterator[None]:
-        """Let Warp work on the device."""
-        with wp.ScopedDevice(self._device):
+        """Let Warp work on the device; one thread at a time."""
+        with WORKING, wp.ScopedDevice(self._device):
             yield
 
     def fits(self, values: Any) -> bool:
@@ -70,7 +71,7 @@ class TorchExchange(NumpyExchange):
         import torch
 
         with ExitStack() as stack:
-            stack.enter_context(wp.ScopedDevice(self._device))
+            stack.enter_context(super().scope())
             if self._device.is_cuda:
                 stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
                 stack.enter_context(wp.ScopedStream(stream))

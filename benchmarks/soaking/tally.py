@@ -1,0 +1,86 @@
+"""What a scenario of the soak has done, what was wrong, and what the processes use."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import pickle
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+import psutil
+
+DONE = ("steps", "comparisons", "pictures", "files", "stops")
+"""What is counted. A stop is one of the safety filter, because a message was late: on a busy machine no fault."""
+WRONG = ("NaN", "outside the space", "other result", "black picture", "left files", "no answer")
+"""What is counted and must not happen."""
+
+
+@dataclass
+class Tally:
+    """What one scenario has done, and what was wrong."""
+
+    done: Counter[str] = field(default_factory=Counter)
+    wrong: Counter[str] = field(default_factory=Counter)
+    _counting: threading.Lock = field(default_factory=threading.Lock)
+
+    def observe(self, space: gymnasium.Space[Any], observation: Any, reward: Any) -> None:
+        """Count a step, NaN, and observations outside their space."""
+        finite = all(np.isfinite(part).all() for part in (*_arrays(observation), reward))
+        inside = space.contains(observation)
+        with self._counting:  # three threads count
+            self.done["steps"] += int(np.size(reward))
+            self.wrong["NaN"] += int(not finite)
+            self.wrong["outside the space"] += int(not inside)
+
+    def compare(self, first: Any, again: Any) -> None:
+        """Count a comparison of two results that must be equal."""
+        self.done["comparisons"] += 1
+        self.wrong["other result"] += int(pickle.dumps(first) != pickle.dumps(again))
+
+
+def _arrays(observation: Any) -> Iterator[Any]:
+    """The arrays of an observation."""
+    if isinstance(observation, dict):
+        for part in observation.values():
+            yield from _arrays(part)
+    else:
+        yield observation
+
+
+Scenario = Callable[[int, Tally], None]
+"""One round of a scenario, called with a seed."""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What this process and its children use."""
+
+    memory: int
+    """Resident memory of this process, bytes."""
+    memory_of_children: int
+    """That of its children, bytes: of the simulated arm."""
+    threads: int
+    files: int
+    processes: int
+
+    @classmethod
+    def now(cls) -> Usage:
+        """After a garbage collection, without the memory that is free and that the allocator of glibc keeps."""
+        gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)
+        process = psutil.Process()
+        children = process.children(recursive=True)
+        family = [process, *children]
+        return cls(
+            process.memory_info().rss,
+            sum(one.memory_info().rss for one in children),
+            sum(one.num_threads() for one in family),
+            sum(one.num_fds() for one in family),
+            len(family),
+        )
