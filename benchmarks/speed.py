@@ -139,6 +139,13 @@ def print_peers() -> None:
         except Exception as error:
             print(f"\n{env_id} cannot run here: {type(error).__name__} {error}")
     ours = "gym_mara/MARACollisionOrient-v0"
+    others: dict[str, dict[str, Any]] = {
+        "max_joint_velocity=1.57": {"max_joint_velocity": 1.57},
+        "backend='dart'": {"backend": "dart"},
+        "backend='mujoco'": {"backend": "mujoco"},
+    }
+    for name, options in others.items():
+        functions[f"{ours}, {name}"] = single(ours, **options)
     measured = rates({ours: single(ours), **functions})
     print("\n## One environment through gymnasium.make\n")
     row("environment", "steps per second", "ours is faster by")
