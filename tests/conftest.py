@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import resource
 import signal
 import threading
 import time
@@ -18,7 +17,7 @@ from hypothesis import settings
 
 from gym_mara.agents.experiments.executor import ONE_THREAD
 from gym_mara.robot import RobotModel
-from tests.helpers import Cli, robot_model, write
+from tests.helpers import Cli, files_of_at_most, robot_model, write
 
 # Tests run in several processes, and start more of them. All share the cores, so each uses one thread.
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
@@ -48,10 +47,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def small_files() -> Iterator[None]:
     """Files of this process may have at most 1,000 bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with files_of_at_most(1000):
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -197,7 +197,11 @@ def test_a_library_that_cannot_write_ends_with_a_clear_error(tmp_path: Path, for
         "main()\n"
     )
     answer = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120
+        [sys.executable, "-B", "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert answer.returncode == 2, answer.stderr
     assert answer.stderr.startswith("error: cannot write 'full-v0': ")

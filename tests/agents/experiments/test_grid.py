@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import resource
 import shutil
 import signal
 import threading
@@ -29,7 +28,7 @@ from gym_mara.agents.experiments.local_executor import run_in_processes
 from gym_mara.errors import GymMaraError
 from tests.agents.experiments import jobs
 from tests.agents.experiments.conftest import GRID, ignore, in_this_process
-from tests.helpers import started
+from tests.helpers import files_of_at_most, started
 
 pytestmark = pytest.mark.slow
 
@@ -111,14 +110,8 @@ def test_a_damaged_result_is_renamed_and_written_again(finished_grid: Path, tmp_
 
 
 def test_runs_that_failed_on_a_full_disk_are_resumed(finished_grid: Path, tmp_path: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(
-            resource.RLIMIT_FSIZE, (20_000, hard)
-        )  # for every file, as on a full disk
+    with files_of_at_most(20_000):  # as on a full disk
         failed = run_grid(tmp_path / "grid", GRID, two_processes, ignore)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert failed.keys() == GRID.runs().keys()
     assert all("File too large" in reason for reason in failed.values())
     assert run_grid(tmp_path / "grid", GRID, in_this_process, ignore) == {}

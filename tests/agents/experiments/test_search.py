@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from gym_mara.agents.experiments.search import (
 from gym_mara.agents.runs.evaluation import make_env
 from gym_mara.agents.training.train import new_agent, preset_of, train
 from gym_mara.errors import GymMaraError, TrainingDivergedError
+from tests.helpers import files_of_at_most
 
 SMALL = Search(env="MARA-v0", algo="acktr", steps=512, trials=2, seeds=1)
 
@@ -255,13 +255,9 @@ def test_a_line_that_was_cut_off_does_not_end_the_search(tmp_path: Path) -> None
 
 
 def test_a_full_disk_is_an_error_that_names_the_log(tmp_path: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     open_study(SMALL, tmp_path)
     size = (tmp_path / "study.log").stat().st_size
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, hard))
-        with pytest.raises(GymMaraError, match=r"cannot write .*study.log.*File too large"):
-            open_study(SMALL, tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    message = r"cannot write .*study.log.*File too large"
+    with files_of_at_most(size + 10), pytest.raises(GymMaraError, match=message):
+        open_study(SMALL, tmp_path)
     assert open_study(SMALL, tmp_path).user_attrs["search"]["env"] == "MARA-v0"

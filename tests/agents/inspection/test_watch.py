@@ -286,7 +286,7 @@ def test_a_full_disk_ends_a_film_with_a_clear_error(tmp_path: Path, suffix: str)
         "except GymMaraError as error: print(error)\n"
     )
     answer = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+        [sys.executable, "-B", "-c", code], check=True, capture_output=True, text=True, timeout=60
     )
     assert str(film) in answer.stdout
     assert len(answer.stdout.splitlines()) == 1
