@@ -65,6 +65,7 @@ def test_a_policy_from_pixels_is_one_of_stable_baselines3(tmp_path: Path) -> Non
         "MARAReach-v0",
         observation="joints+pixels",
         pixel_camera=camera,
+        pixel_size=model.observation_space["depth"].shape[:2],  # type: ignore[index]
         pixel_channels=["rgb", "depth"],
         autoreset_mode="SameStep",
     )
