@@ -107,9 +107,10 @@ class _Gif:
         self._pictures.append(Image.fromarray(picture))
 
     def close(self) -> None:
-        first, *others = self._pictures
-        duration = 1000.0 / self._rate
-        first.save(self._file, save_all=True, append_images=others, duration=duration, loop=0)
+        if self._pictures:  # without one, the error that came before it is told
+            first, *others = self._pictures
+            duration = 1000.0 / self._rate
+            first.save(self._file, save_all=True, append_images=others, duration=duration, loop=0)
 
 
 def check_film_path(path: Path) -> None:

@@ -257,12 +257,15 @@ def test_a_wrong_path_of_a_film_is_an_error_before_the_policy_is_played(
     assert (tmp_path / "there.mp4").read_text() == "kept"
 
 
-def test_an_interrupted_film_leaves_no_file(tmp_path: Path) -> None:
-    film = tmp_path / "film.mp4"
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_an_interrupted_film_leaves_no_file(tmp_path: Path, suffix: str, count: int) -> None:
+    film = tmp_path / f"film{suffix}"
 
     def interrupted() -> None:
         with Film(film, 25.0) as unfinished:
-            unfinished.add(np.zeros((120, 160, 3), np.uint8))
+            for _ in range(count):
+                unfinished.add(np.zeros((120, 160, 3), np.uint8))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
