@@ -98,7 +98,7 @@ class Reacher(BaseFeaturesExtractor):
         self.of_target = layers(256, 128, 64, 3)
 
     def see(self, state: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """The target (N, 3), m, and the logarithm of the share of the target that each pixel shows (N, H x W)."""
+        """The target (N, 3), m, and the log-probability of each pixel that it shows the target (N, H x W)."""
         points = (self.eye + depth.permute(0, 3, 1, 2) * self.rays).clamp(-2.0, 2.0)
         from_tool, colours = points - self.tool(state)[..., None, None], pixels / 127.5 - 1.0
         bounded = from_tool / (from_tool.norm(dim=1, keepdim=True) + 0.2)
@@ -110,7 +110,7 @@ class Reacher(BaseFeaturesExtractor):
         return self.locate(*parts, chosen.detach()), shares
 
     def locate(self, points: Tensor, from_tool: Tensor, colours: Tensor, shares: Tensor) -> Tensor:
-        """The target (N, 3), m, from P points in the world, their ways from the tool, their colours (N, P, 3) and their shares (N, P)."""
+        """The target (N, 3), m, from P points in the world, their ways from the tool, their colours (N, P, 3) and their log-probabilities (N, P)."""
         weights = shares.softmax(1)[..., None]
         centre = (weights * points).sum(1)
         ways = torch.cat([points - centre[:, None], from_tool], 2) / MARKER
@@ -253,12 +253,12 @@ class School:
     def seeing(
         self, state: Tensor, pixels: Tensor, depth: Tensor, is_target: Tensor, target: Tensor
     ) -> Tensor:
-        """How wrong the seen targets are, and how surprising the pixels that show them."""
+        """How wrong the seen targets are, plus the cross-entropy of the pixels that show them."""
         seen, shares = self.reacher.see(state, pixels.float(), depth.float())
         count = is_target.sum(1)
-        surprise = -(shares * is_target).sum(1) / count.clamp(min=1)
+        cross_entropy = -(shares * is_target).sum(1) / count.clamp(min=1)
         wrong = (seen - target).norm(dim=1).clamp(max=0.5)
-        return 10.0 * wrong.mean() + 0.3 * surprise[count > 0].mean()
+        return 10.0 * wrong.mean() + 0.3 * cross_entropy[count > 0].mean()
 
 
 def evaluate(model: PPO, episodes: int) -> None:
