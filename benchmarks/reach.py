@@ -27,7 +27,7 @@ from reach_figures import CELL, FEWEST, PARTS, Places, draw_curves, draw_workspa
 from gym_mara.agents.evaluation.baselines import evaluate_baseline
 from gym_mara.agents.evaluation.episodes import episode_seeds
 from gym_mara.agents.evaluation.metrics import in_short, spread
-from gym_mara.agents.inspection.watch import film_targets
+from gym_mara.agents.inspection.watch import film_targets, show_run
 from gym_mara.agents.runs.evaluation import evaluate_run, make_arms, options_on
 from gym_mara.agents.runs.folder import POLICIES, RunFolder, versions
 from gym_mara.backends import backend_names, backend_settings
@@ -241,7 +241,7 @@ def film(run: RunFolder, file: Path, backend: str, asked: argparse.Namespace) ->
     start, options = time.perf_counter(), {**FILM, **options_for(backend, asked)}
     with writing(file), tempfile.TemporaryDirectory(dir=file.parent) as folder:
         new = Path(folder) / file.name
-        film_targets(run, new, backend, options, targets=TARGETS, which=asked.policy, rate=RATE)
+        film_targets(show_run(run, asked.policy), new, backend, options, targets=TARGETS, rate=RATE)
         os.replace(new, file)
     tell(f"{file}, {file.stat().st_size / 1e6:.1f} MB", start)
 

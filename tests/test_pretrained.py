@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 
@@ -108,6 +109,39 @@ def test_an_exported_policy_is_watched_in_its_own_environment_or_another(
 
 
 @pytest.mark.parametrize(
+    "way", ["--seconds 0.1", "--targets 1", "--seconds 0.1 --backend pinocchio,mujoco"]
+)
+def test_a_pretrained_policy_is_filmed(two: Path, gym_mara: Cli, way: str) -> None:
+    small = "--set", "width=64", "--set", "height=48"
+    chosen = "--policy", "pretrained", "--env", "MARAPose-v0", *way.split(), *small
+    code, out, error = gym_mara("watch", *chosen, "--video", two / "film.gif")
+    assert (code, error) == (0, "")
+    assert out.splitlines()[-1] == str(two / "film.gif")
+    wide = 128 if "mujoco" in way else 64
+    assert iio.improps(two / "film.gif").shape[1:3] == (48, wide)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--env", "MARA-v0", "--video", "film.gif"], "does not fit the environment: it observes"),
+        (["--video", "film.avi"], "unknown format of a video '.avi'"),
+        (["--video", "policy.gif"], "exists and is not overwritten"),
+    ],
+)
+def test_no_film_is_made_of_what_cannot_be_shown(
+    two: Path, gym_mara: Cli, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
+) -> None:
+    monkeypatch.chdir(two)
+    (two / "policy.gif").write_text("kept")
+    code, _, error = gym_mara("watch", "--policy", two / "MARAReach-v0.onnx", *options)
+    assert code == 2
+    assert message in error
+    assert (two / "policy.gif").read_text() == "kept"
+    assert not list(two.glob("film*"))
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ("watch --policy pretrained", "no pretrained policy for 'MARA-v0'; environments that have one: MARAPose-v0, MARAReach-v0"),
@@ -116,7 +150,7 @@ def test_an_exported_policy_is_watched_in_its_own_environment_or_another(
         ("watch run --policy pretrained", "a run has its own policies, last and best: leave out the run folder, or --policy"),
         ("evaluate run --policy policy.onnx", "a run has its own policies"),
         ("watch --policy missing.onnx", "cannot read 'missing.onnx': there is no such file"),
-        ("watch --policy policy.onnx --video film.mp4", "only the policy of a run is filmed: leave out --video"),
+        ("watch --policy policy.onnx --targets 3", "only --video has a length: leave out --targets"),
         ("watch --policy policy.onnx --seconds 3", "only --video has a length: leave out --seconds"),
         ("watch --policy policy.onnx --backend dart,mujoco", "give one --backend"),
         ("export run new.onnx --policy pretrained", "unknown policy 'pretrained'. Valid: best, last"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,6 +26,9 @@ from gym_mara.cli.common import (
 )
 from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
 from gym_mara.errors import GymMaraError
+
+if TYPE_CHECKING:
+    from gym_mara.agents.inspection.watch import Show
 
 VIEWER_SPEEDS, VIDEO_SPEEDS = (0.1, 5.0), (0.01, 100.0)
 """The lowest and the highest speed, times real time."""
@@ -77,9 +80,9 @@ def watch(
     ] = None,
     settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
-    """Watch a policy in the browser, or film that of a run; without a policy, jog the joints.
+    """Watch a policy in the browser, or film it; without a policy, jog the joints.
 
-    Needs the extra render, with a run also the extra train, and with an exported policy the extra deploy.
+    Needs the extra render, with a run or --video also the extra train, and with an exported policy the extra deploy.
     """
     file = exported_file(run, policy, env)
     _refuse_what_has_no_effect(context, run, file)
@@ -97,48 +100,61 @@ def watch(
         )
     if targets is not None and len(chosen) > 1:
         raise GymMaraError("a video of several targets shows one backend: give one --backend")
-    if file is not None:
-        from gym_mara.viewer.exported import watch_exported
-
-        name, one = env if is_given(context, "env") else None, chosen[0] if chosen else None
-        with interruptible("Closed."):
-            watch_exported(file, name, one, options, speed, _print)
-        return
-    if run is None:
-        from gym_mara.viewer import watch as open_viewer
-
-        # A user who jogs the arm into the table should see it there, not reset to its start.
-        keywords = {"on_collision": "continue", **options}
-        with interruptible("Closed."):
-            open_viewer(env, chosen[0] if chosen else DEFAULT_BACKEND, keywords, speed=speed)
-        return
-    with needs_agents():
-        from gym_mara.agents.inspection.watch import film_run, film_targets, watch_run
-        from gym_mara.agents.runs.folder import RunFolder
-
-    folder = RunFolder.open(run)
-    backends = list(chosen) or [folder.config.backend]
+    name = env if is_given(context, "env") else None
     if video is not None:
+        with needs_agents():
+            from gym_mara.agents.inspection.watch import film_episode, film_targets
+
         with interruptible("Interrupted; no video was written."):
+            show = _show(run, policy, file, name)
+            backends = chosen or [show.backend]
             if targets is None:
-                film = partial(film_run, backends=backends, seconds=seconds)
+                film = partial(film_episode, show, video, list(backends), seconds=seconds)
             else:
-                film = partial(film_targets, backend=backends[0], targets=targets)
-            film(folder, video, options=options, which=policy, speed=speed, log=_print)
+                film = partial(film_targets, show, video, backends[0], targets=targets)
+            film(options=options, speed=speed, log=_print)
         out.print(str(video), soft_wrap=True)
         return
     with interruptible("Closed."):
-        watch_run(folder, backends[0], options, policy, speed, _print)
+        if file is not None:
+            from gym_mara.viewer.exported import watch_exported
+
+            one = chosen[0] if chosen else None
+            watch_exported(file, name, one, options, speed, _print)
+        elif run is None:
+            from gym_mara.viewer import watch as open_viewer
+
+            # A user who jogs the arm into the table should see it there, not reset to its start.
+            keywords = {"on_collision": "continue", **options}
+            open_viewer(env, chosen[0] if chosen else DEFAULT_BACKEND, keywords, speed=speed)
+        else:
+            with needs_agents():
+                from gym_mara.agents.inspection.watch import watch_run
+                from gym_mara.agents.runs.folder import RunFolder
+
+            folder = RunFolder.open(run)
+            backend_shown = chosen[0] if chosen else folder.config.backend
+            watch_run(folder, backend_shown, options, policy, speed, _print)
+
+
+def _show(run: Path | None, policy: str, file: Path | None, env: str | None) -> Show:
+    """What a video shows: a policy of a run, or the exported policy of a file."""
+    from gym_mara.agents.inspection.watch import show_exported, show_run
+    from gym_mara.agents.runs.folder import RunFolder
+    from gym_mara.deploy import OnnxPolicy
+
+    if file is not None:
+        return show_exported(OnnxPolicy(file), env)
+    assert run is not None
+    return show_run(RunFolder.open(run), policy)
 
 
 def _refuse_what_has_no_effect(context: typer.Context, run: Path | None, file: Path | None) -> None:
     """Refuse the options of `watch` that mean nothing with this run or this exported policy, or without any."""
-    if file is not None:
-        refuse(context, "only the policy of a run is filmed", "video", "targets")
-    elif run is None:
+    if run is None and file is None:
         names = "policy", "video", "targets"
         refuse(context, "without a run folder there is no policy to play", *names)
-    else:
+    elif run is not None:
         refuse(context, "a run has its own environment", "env")
     if not is_given(context, "video"):
         refuse(context, "the viewer has no end; only --video has a length", "seconds", "targets")

@@ -13,7 +13,7 @@ from gym_mara.agents.evaluation.metrics import METRICS, measure, statistics_in_s
 from gym_mara.agents.evaluation.rollout import roll_out
 from gym_mara.agents.inspection import report_figures as figures
 from gym_mara.agents.inspection.report_figures import Episode
-from gym_mara.agents.inspection.watch import film_run
+from gym_mara.agents.inspection.watch import film_episode, show_run
 from gym_mara.agents.runs.evaluation import Player, options_on
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.backends import usable_backends
@@ -115,5 +115,5 @@ def _video(run: RunFolder, backends: list[str], which: str) -> str:
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
         size = {"width": 480, "height": 400}
-        film_run(run, path, backends, size, which=which, seconds=_VIDEO_SECONDS, rate=25.0)
+        film_episode(show_run(run, which), path, backends, size, seconds=_VIDEO_SECONDS, rate=25.0)
         return base64.b64encode(path.read_bytes()).decode()

@@ -6,14 +6,18 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gym_mara.agents.evaluation.exported import begin_exported
 from gym_mara.agents.evaluation.metrics import HELD, SETTLED, in_short
-from gym_mara.agents.runs.evaluation import Player, options_on
+from gym_mara.agents.runs.evaluation import Player, Playing, options_on
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.deploy import OnnxPolicy
+from gym_mara.deploy.environment import backend_of
 from gym_mara.envs.outcome import Outcome
 from gym_mara.envs.travel import VELOCITY_LIMIT, travel_note
 from gym_mara.envs.workspace import RobotWorkspace
@@ -25,43 +29,74 @@ _STILL = 0.5
 """How long a film shows the start pose before the arm moves, and a collision, s."""
 
 
-def film_run(
-    run: RunFolder,
+@dataclass(frozen=True)
+class Show:
+    """A policy that is shown."""
+
+    backend: str
+    """That of the training, or the default one if that does not work here."""
+    play: Callable[[str, dict[str, Any]], Playing]
+    """Makes what plays it on a backend, with more keyword arguments of the environment.
+
+    It raises GymMaraError if the policy is missing or damaged or does not fit, or if an option is unknown or out of range.
+    """
+
+
+def show_run(run: RunFolder, which: str = "last") -> Show:
+    """Shows a policy of a run, "last" or "best"."""
+
+    def play(backend: str, options: dict[str, Any]) -> Playing:
+        return Player(run, backend, options_on(backend, run.config, options), which=which)
+
+    return Show(run.config.backend, play)
+
+
+def show_exported(policy: OnnxPolicy, env: str | None = None) -> Show:
+    """Shows an exported policy in an environment of this name; by default that of its training."""
+
+    def play(backend: str, options: dict[str, Any]) -> Playing:
+        keywords = policy.keywords(env, backend, **options)
+        backend = keywords.pop("backend")
+        return Playing(env or policy.about.env, backend, keywords, begin_exported(policy))
+
+    return Show(backend_of(policy.about), play)
+
+
+def film_episode(
+    show: Show,
     path: Path,
     backends: list[str],
     options: dict[str, Any],
     *,
-    which: str = "last",
     seconds: float = 6.0,
     speed: float = 1.0,
     rate: float = HIGHEST_RATE,
     log: Callable[[str], None] | None = None,
 ) -> None:
-    """Film the start of an episode of a run's policy on each backend, side by side.
+    """Film the start of an episode of a policy on each backend, side by side.
 
     Joints that would teleport move at the robot's velocity limit, unless the run or the options have max_joint_velocity.
 
     Args:
-        run: the run.
+        show: the policy.
         path: a new file, .mp4 or .gif.
         backends: the backends.
-        options: keyword arguments of the environment, in addition to those of the run.
-        which: the policy, "last" or "best".
+        options: keyword arguments of the environment, in addition to those of the training.
         seconds: length of the filmed part of the episode, s.
         speed: times real time.
         rate: highest number of pictures per second.
         log: is called with a sentence about each backend whose joints get the velocity limit.
 
     Raises:
-        GymMaraError: the file exists or cannot be written, the policy is missing or damaged, or a value is out of its range.
+        GymMaraError: the file exists or cannot be written, or the policy cannot be shown (see `Show`).
     """
     check_film_path(path)  # an error comes before the policy is played
     with ExitStack() as stack:
         players, labels = [], []
         for backend in backends:
-            settings = _settings(run, backend, options, which, log) | {"render_mode": "rgb_array"}
-            players.append(stack.enter_context(Player(run, backend, settings, which=which)))
-            limit = settings.get(VELOCITY_LIMIT)
+            player = stack.enter_context(_filmed(show, backend, options, log))
+            limit = player.options.get(VELOCITY_LIMIT)
+            players.append(player)
             labels.append(backend if limit is None else f"{backend}, at most {limit:.3g} rad/s")
         period = players[0].env.simulation.backend.control_period
         every = math.ceil(speed / period / rate)
@@ -76,7 +111,16 @@ def film_run(
                 film.add(_side_by_side(players, labels))
 
 
-def _side_by_side(players: list[Player], labels: list[str]) -> Any:
+def _filmed(
+    show: Show, backend: str, options: dict[str, Any], log: Callable[[str], None] | None
+) -> Playing:
+    """What plays a policy, with pictures and with joints that travel."""
+    return show.play(
+        backend, _travelling(show, backend, options, log) | {"render_mode": "rgb_array"}
+    )
+
+
+def _side_by_side(players: list[Playing], labels: list[str]) -> Any:
     """The players' pictures in one; if there are several, each with its label."""
     pictures = [pictures[0] for player in players if (pictures := player.env.render())]
     if len(players) > 1:
@@ -85,42 +129,40 @@ def _side_by_side(players: list[Player], labels: list[str]) -> Any:
 
 
 def film_targets(
-    run: RunFolder,
+    show: Show,
     path: Path,
     backend: str,
     options: dict[str, Any],
     *,
     targets: int,
-    which: str = "last",
     speed: float = 1.0,
     rate: float = HIGHEST_RATE,
     log: Callable[[str], None] | None = None,
 ) -> None:
-    """Film a run's policy that reaches random targets in a row: the arm goes on from where it is, without a reset.
+    """Film a policy that reaches random targets in a row: the arm goes on from where it is, without a reset.
 
     The next target comes when the tool has stayed at the last one for HELD s, or after the length of an episode. A straight joint
     move without a collision leads to it. If the arm collides, it is put back to where the film began, and the next target comes.
 
     Args:
-        run, path, options, which, speed, rate, log: as in `film_run`.
+        show, path, options, speed, rate, log: as in `film_episode`.
         backend: the backend.
         targets: how many.
 
     Raises:
-        GymMaraError: as in `film_run`; the task does not draw its targets, or the options have on_collision.
+        GymMaraError: as in `film_episode`; the task does not draw its targets, or the options have on_collision.
     """
     check_film_path(path)
     if "on_collision" in options:
         raise GymMaraError(
             "a film of several targets puts an arm that collides back to its start: leave out on_collision"
         )
-    settings = _settings(run, backend, {**options, "on_collision": "reset"}, which, log)
-    with Player(run, backend, settings | {"render_mode": "rgb_array"}, which=which) as player:
+    with _filmed(show, backend, {**options, "on_collision": "reset"}, log) as player:
         simulation = player.env.simulation
         if not simulation.task.random_goal:
             raise GymMaraError(
-                f"{run.config.env} has the same target in every episode: film a run of an environment that draws its targets, "
-                "such as MARAReach-v0, or one episode"
+                f"{player.env_name} has the same target in every episode: film a policy of an environment that draws its "
+                "targets, such as MARAReach-v0, or one episode"
             )
         workspace, generator = RobotWorkspace(simulation.robot), np.random.default_rng(0)
         period = simulation.backend.control_period
@@ -138,7 +180,9 @@ def film_targets(
                 _film_target(player, film, title, shown, still)
 
 
-def _film_target(player: Player, film: Film, title: str, shown: Iterator[bool], still: int) -> None:
+def _film_target(
+    player: Playing, film: Film, title: str, shown: Iterator[bool], still: int
+) -> None:
     """Film the way to a target, until it is reached or given up, or the arm collides.
 
     Args:
@@ -166,13 +210,13 @@ def _add(film: Film, picture: Any, times: int) -> None:
         film.add(picture)
 
 
-def _labelled_picture(player: Player, text: str) -> Any:
+def _labelled_picture(player: Playing, text: str) -> Any:
     pictures = player.env.render()
     assert pictures is not None
     return labelled(pictures[0], text)
 
 
-def _errors(player: Player, outcome: Outcome) -> str:
+def _errors(player: Playing, outcome: Outcome) -> str:
     """How far the arm is from its target, as a text; the angle only if the task judges it."""
     info, texts = outcome.info, []
     if "position_error" in info:
@@ -207,32 +251,25 @@ def watch_run(
         options: keyword arguments of the environment, in addition to those of the run.
         which: the policy, "last" or "best".
         speed: times real time.
-        log: as in `film_run`, which also tells how joints move that would teleport.
+        log: as in `film_episode`, which also tells how joints move that would teleport.
 
     Raises:
         GymMaraError: the policy is missing or damaged, a value is out of its range, or the viewer cannot open.
     """
-    settings = _settings(run, backend, options, which, log)
-    with Player(run, backend, settings, which=which) as player:
+    show = show_run(run, which)
+    with show.play(backend, _travelling(show, backend, options, log)) as player:
         begin, settings = player.begin, player.options
     watch(run.config.env, backend, settings, begin, speed=speed, seed=run.config.seed)
 
 
-def _settings(
-    run: RunFolder,
-    backend: str,
-    options: dict[str, Any],
-    which: str,
-    log: Callable[[str], None] | None,
+def _travelling(
+    show: Show, backend: str, options: dict[str, Any], log: Callable[[str], None] | None
 ) -> dict[str, Any]:
-    """The keyword arguments with which a run is shown on a backend."""
-    settings = options_on(backend, run.config, options)
-    if VELOCITY_LIMIT in settings:
-        return settings
-    with Player(run, backend, settings, which=which) as player:
-        limit = player.velocity_limit
+    """The options with which a policy is shown: joints that would teleport travel, unless VELOCITY_LIMIT is given."""
+    with show.play(backend, options) as player:
+        limit = None if VELOCITY_LIMIT in player.options else player.velocity_limit
     if limit is None:
-        return settings
+        return options
     if log is not None:
         log(travel_note(backend, limit))
-    return settings | {VELOCITY_LIMIT: limit}
+    return options | {VELOCITY_LIMIT: limit}

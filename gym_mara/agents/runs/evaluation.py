@@ -6,6 +6,8 @@ import math
 from types import TracebackType
 from typing import Any
 
+from typing_extensions import Self
+
 from gym_mara.agents.evaluation.episodes import arms_of_a_batch, episode_seeds, play_episodes
 from gym_mara.agents.evaluation.rollout import Act, Begin
 from gym_mara.agents.runs.config import check_options
@@ -66,15 +68,75 @@ def episodes_to_judge(config: RunConfig) -> int:
         env.close()
 
 
-class Player:
-    """A run's deterministic policy on N arms of one backend, at the start of episodes without a time limit.
+class Playing:
+    """A deterministic policy on N arms of one backend, at the start of episodes without a time limit.
 
     Use it in a `with` statement.
 
     Args:
+        env: the name of the environment.
+        backend: the name of the backend.
+        options: keyword arguments of the environment.
+        begin: what acts; it refuses a simulation that the policy does not fit.
+        arms: N.
+
+    Raises:
+        GymMaraError: the policy does not fit the environment, or an option is unknown or out of range.
+    """
+
+    def __init__(
+        self, env: str, backend: str, options: dict[str, Any], begin: Begin, arms: int = 1
+    ) -> None:
+        self.env_name = env
+        """The name of the environment."""
+        self.episode_steps = environment(env).max_episode_steps
+        """The length of an episode, steps."""
+        self.options = options
+        """The keyword arguments of the environment."""
+        self._begin = begin
+        self.env = make_arms(env, backend, arms, options, max_episode_steps=None)
+        try:
+            self._observation, _ = self.env.reset(seed=episode_seeds(0, 0, arms))
+            self._act = self.begin(self.env.simulation)
+        except BaseException:
+            self.env.close()
+            raise
+
+    def step(self) -> Outcome:
+        """Let the policy act for one step; the outcome holds the state that the task judged."""
+        self._observation, *_ = self.env.step(self._act(self._observation))
+        outcome = self.env.simulation.outcome
+        assert outcome is not None
+        return outcome
+
+    def begin(self, simulation: Simulation) -> Act:
+        """What acts in the episodes of an evaluation."""
+        return self._begin(simulation)
+
+    @property
+    def velocity_limit(self) -> float | None:
+        """If the joints teleport, the velocity limit with which they travel, rad/s; see `gym_mara.envs.travel`."""
+        return travel_velocity(self.env.simulation)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.env.close()
+
+
+class Player(Playing):
+    """A run's deterministic policy on N arms of one backend, at the start of episodes without a time limit.
+
+    Args:
         run: the run.
         backend: the backend.
-        options: keyword arguments of the environment, from `options_on`.
+        options: keyword arguments of the environment, from `options_on`; the policy's action mode and steps are added.
         which: the policy, "last" or "best".
         arms: N.
 
@@ -91,47 +153,14 @@ class Player:
         which: str = "last",
         arms: int = 1,
     ) -> None:
-        config = run.config
-        self.policy = load_policy(run, which)
-        self.episode_steps = environment(config.env).max_episode_steps
-        """The length of an episode, steps."""
-        self.options = self.policy.about.keywords(backend, options)
-        """The keyword arguments of the environment, with the policy's action mode and steps."""
-        self.env = make_arms(config.env, backend, arms, self.options, max_episode_steps=None)
-        try:
-            self.policy.check(self.env.simulation, any_robot=chose_robot(options))
-            self._observation, _ = self.env.reset(seed=episode_seeds(0, 0, arms))
-        except BaseException:
-            self.env.close()
-            raise
-        self._act = self.begin(self.env.simulation)
+        self.policy = policy = load_policy(run, which)
 
-    def step(self) -> Outcome:
-        """Let the policy act for one step; the outcome holds the state that the task judged."""
-        self._observation, *_ = self.env.step(self._act(self._observation))
-        outcome = self.env.simulation.outcome
-        assert outcome is not None
-        return outcome
+        def begin(simulation: Simulation) -> Act:
+            policy.check(simulation, any_robot=chose_robot(options))
+            return policy.begin(simulation)
 
-    def begin(self, simulation: Simulation) -> Act:
-        """What acts in the episodes of an evaluation."""
-        return self.policy.begin(simulation)
-
-    @property
-    def velocity_limit(self) -> float | None:
-        """If the joints teleport, the velocity limit with which they travel, rad/s; see `gym_mara.envs.travel`."""
-        return travel_velocity(self.env.simulation)
-
-    def __enter__(self) -> Player:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.env.close()
+        keywords = policy.about.keywords(backend, options)
+        super().__init__(run.config.env, backend, keywords, begin, arms)
 
 
 def evaluate_run(

@@ -24,7 +24,7 @@ import pytest
 from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
-from gym_mara.agents.inspection.watch import film_run, film_targets, watch_run
+from gym_mara.agents.inspection.watch import film_episode, film_targets, show_run, watch_run
 from gym_mara.agents.runs.evaluation import Player
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
@@ -67,7 +67,7 @@ def test_a_film_shows_the_start_of_an_episode(
     finished_run: RunFolder, tmp_path: Path, suffix: str
 ) -> None:
     film = tmp_path / f"film{suffix}"
-    film_run(finished_run, film, ["dart"], SMALL, seconds=0.4)
+    film_episode(show_run(finished_run), film, ["dart"], SMALL, seconds=0.4)
     shown = pictures(film)
     if suffix == ".gif":  # one picture of the start pose, with a long duration
         times = [imageio.immeta(film, index=index)["duration"] for index in range(len(shown))]
@@ -92,7 +92,7 @@ def test_two_backends_are_filmed_side_by_side(
 
     monkeypatch.setattr(watch_module, "labelled", noted)
     film = tmp_path / "film.mp4"
-    film_run(finished_run, film, ["pinocchio", "dart"], SMALL, seconds=0.2)
+    film_episode(show_run(finished_run), film, ["pinocchio", "dart"], SMALL, seconds=0.2)
     shown = pictures(film)
     assert shown.shape[1:] == (120, 320, 3)
     label, scene = np.s_[:18], np.s_[18:]
@@ -161,7 +161,7 @@ def test_in_a_film_of_targets_the_arm_goes_on_from_each_that_it_has_reached(
         return StraightActions(simulation).to(goals[target])
 
     steps, film = Steps(monkeypatch, straight), tmp_path / "film.gif"
-    film_targets(random_target_run, film, "pinocchio", SMALL, targets=3, rate=5.0)
+    film_targets(show_run(random_target_run), film, "pinocchio", SMALL, targets=3, rate=5.0)
     ends = [outcome.state.q[0] for outcome in steps.outcomes]
     assert len(set(steps.targets)) == 3
     np.testing.assert_array_equal(steps.starts[1:], ends[:-1])
@@ -184,7 +184,9 @@ def test_a_film_of_targets_shows_a_collision_and_puts_the_arm_back(
 ) -> None:
     into_the_table = np.array([[0.0, 2.5, 0.0, 0.0, 0.0, 0.0]])
     steps = Steps(monkeypatch, lambda *_: into_the_table)
-    film_targets(random_target_run, tmp_path / "film.gif", "pinocchio", SMALL, targets=2, rate=5.0)
+    film_targets(
+        show_run(random_target_run), tmp_path / "film.gif", "pinocchio", SMALL, targets=2, rate=5.0
+    )
     collided = [bool(outcome.state.collided[0]) for outcome in steps.outcomes]
     assert collided.count(True) == 2
     assert steps.labels[-1] == "target 2 of 2: collision"
@@ -197,9 +199,11 @@ def test_a_film_of_targets_needs_an_environment_that_draws_them(
 ) -> None:
     film = tmp_path / "film.gif"
     with pytest.raises(GymMaraError, match=r"MARACollisionOrient-v0 has the same target in every"):
-        film_targets(finished_run, film, "pinocchio", SMALL, targets=2)
+        film_targets(show_run(finished_run), film, "pinocchio", SMALL, targets=2)
     with pytest.raises(GymMaraError, match="leave out on_collision"):
-        film_targets(random_target_run, film, "pinocchio", {"on_collision": "continue"}, targets=2)
+        film_targets(
+            show_run(random_target_run), film, "pinocchio", {"on_collision": "continue"}, targets=2
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -222,7 +226,14 @@ def test_joints_that_would_teleport_are_shown_travelling(
     watch_run(finished_run, "dart", {}, "last", 1.0, notes.append)
     lowest = pytest.approx(robot_model("mara").velocity_limit.min())
     assert watched == [{"max_joint_velocity": lowest}, {"max_joint_velocity": None}, {}]
-    film_run(finished_run, tmp_path / "a.gif", ["pinocchio"], SMALL, seconds=0.1, log=notes.append)
+    film_episode(
+        show_run(finished_run),
+        tmp_path / "a.gif",
+        ["pinocchio"],
+        SMALL,
+        seconds=0.1,
+        log=notes.append,
+    )
     assert len(notes) == 2, "one line for each that is shown otherwise than it was trained"
     assert "--set max_joint_velocity=null" in notes[0]
 
@@ -233,7 +244,7 @@ def test_the_speed_of_a_film(
     finished_run: RunFolder, tmp_path: Path, speed: float, rate: float
 ) -> None:
     film = tmp_path / "film.mp4"
-    film_run(finished_run, film, ["pinocchio"], SMALL, seconds=1.2, speed=speed)
+    film_episode(show_run(finished_run), film, ["pinocchio"], SMALL, seconds=1.2, speed=speed)
     properties = imageio.immeta(film, plugin="FFMPEG")
     assert properties["fps"] == pytest.approx(rate, rel=0.01)
     assert properties["duration"] == pytest.approx(0.5 + 1.2 / speed, abs=0.1)
@@ -253,7 +264,7 @@ def test_a_wrong_path_of_a_film_is_an_error_before_the_policy_is_played(
 ) -> None:
     (tmp_path / "there.mp4").write_text("kept")
     with pytest.raises(GymMaraError, match=message):
-        film_run(None, tmp_path / name, ["pinocchio"], {})  # type: ignore[arg-type]
+        film_episode(None, tmp_path / name, ["pinocchio"], {})  # type: ignore[arg-type]
     assert (tmp_path / "there.mp4").read_text() == "kept"
 
 
@@ -395,7 +406,7 @@ def test_a_full_disk_ends_a_report_with_a_clear_error(
         path.write_text("a half")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(report_module, "film_run", full)
+    monkeypatch.setattr(report_module, "film_episode", full)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with pytest.raises(GymMaraError, match=r"cannot write .*No space left"):
         report_module._video(RunFolder(tmp_path, config()), ["pinocchio"], "last")
