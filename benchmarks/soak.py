@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from soaking import environments, ros, written
-from soaking.tally import DONE, WRONG, Tally, Usage
+from soaking.tally import DONE, WRONG, Tally, Usage, few_arenas
 
 GROWTH = 0.01
 """The largest growth of memory that passes."""
@@ -45,6 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     arguments = parser.parse_args()
+    few_arenas()
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ros.simulated_arm():
         todo = {

@@ -76,7 +76,10 @@ def read_geometry(
     text = ElementTree.tostring(root, encoding="unicode")
     of_kind = pin.GeometryType.COLLISION if kind == "collision" else pin.GeometryType.VISUAL
     with parsing(urdf):
-        geometry_model = pin.buildGeomFromUrdfString(model, text, of_kind)
+        geometry_model = (
+            pin.GeometryModel()
+        )  # without it Pinocchio 4.1 would keep an object of Python for ever
+        pin.buildGeomFromUrdfString(model, text, of_kind, geometry_model)
     shapes: list[Shape] = []
     for geometry_object in geometry_model.geometryObjects:
         if geometry_object.name in meshes:
