@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -67,8 +68,11 @@ def _parts(path: Path, version: tuple[int, int]) -> tuple[trimesh.Trimesh, ...]:
             f"the mesh {str(path)!r} has an unknown format; supported are {', '.join(FORMATS)}"
         )
     try:
-        checked = _CHECKS[kind](path)
-        found = _read(path, kind, checked)
+        with warnings.catch_warnings():
+            # NumPy 2.5 warns of pycollada, also where warnings are errors.
+            warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning)
+            checked = _CHECKS[kind](path)
+            found = _read(path, kind, checked)
     except Exception as error:  # the readers of the formats raise whatever their parsers do
         reason = str(error) or type(error).__name__
         raise GymMaraError(f"the mesh {str(path)!r} cannot be read: {reason}") from error
