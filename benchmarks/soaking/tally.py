@@ -15,12 +15,16 @@ import gymnasium
 import numpy as np
 import psutil
 
+from gym_mara.rendering.drawing import free
+
 DONE = ("steps", "comparisons", "pictures", "files", "stops")
 """What is counted. A stop is one of the safety filter, because a message was late: on a busy machine no fault."""
 WRONG = ("NaN", "outside the space", "other result", "black picture", "left files", "no answer")
 """What is counted and must not happen."""
 
 
+_NO_RENDERER = -1
+"""A key that no renderer has."""
 _M_ARENA_MAX = -8
 """The number of glibc's parameter in malloc.h."""
 
@@ -86,6 +90,7 @@ class Usage:
     def now(cls) -> Usage:
         """After a garbage collection, without the memory that is free and that the allocator of glibc keeps."""
         gc.collect()
+        free(_NO_RENDERER, wait=True)  # the drawing thread has freed what was collected
         ctypes.CDLL(None).malloc_trim(0)
         process = psutil.Process()
         children = process.children(recursive=True)
