@@ -109,8 +109,10 @@ class _Gif:
     def close(self) -> None:
         if self._pictures:  # without one, the error that came before it is told
             first, *others = self._pictures
-            duration = 1000.0 / self._rate
-            first.save(self._file, save_all=True, append_images=others, duration=duration, loop=0)
+            # A GIF counts hundredths of a second: each picture begins at the nearest one, so that the errors do not add up.
+            begins = np.round(np.arange(len(self._pictures) + 1) * 100.0 / self._rate)
+            times = (10.0 * np.diff(begins)).tolist()
+            first.save(self._file, save_all=True, append_images=others, duration=times, loop=0)
 
 
 def check_film_path(path: Path) -> None:

@@ -303,6 +303,17 @@ def test_the_speed_of_a_film(
     assert properties["duration"] == pytest.approx(0.5 + 1.2 / speed, abs=0.1)
 
 
+@pytest.mark.parametrize("rate", [15.0, 37.5, 40.0, 50.0])
+def test_a_gif_has_the_rate_that_was_asked_for(tmp_path: Path, rate: float) -> None:
+    count = 30
+    with Film(tmp_path / "film.gif", rate) as film:
+        for grey in range(count):
+            film.add(np.full((16, 16, 3), 8 * grey, np.uint8))
+    times = [imageio.immeta(tmp_path / "film.gif", index=i)["duration"] for i in range(count)]
+    assert sum(times) == pytest.approx(1000.0 * count / rate, abs=10)
+    assert max(times) - min(times) <= 10
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
