@@ -314,6 +314,15 @@ def test_a_gif_has_the_rate_that_was_asked_for(tmp_path: Path, rate: float) -> N
     assert max(times) - min(times) <= 10
 
 
+def test_a_gif_is_held_with_one_byte_for_a_point_until_it_is_written(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    with Film(tmp_path / "film.gif", 25.0) as film:
+        for _ in range(3):
+            film.add(picture)
+        assert sum(len(held.tobytes()) for held in film._writer._pictures) == 3 * 32 * 32
+    assert len(pictures(tmp_path / "film.gif")) == 1, "equal pictures are one that lasts longer"
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
