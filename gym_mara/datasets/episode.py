@@ -103,9 +103,18 @@ class Steps:
         succeeded = None if success[0] is None else _column(success, arm)
         pixels = None
         if self._pictures is not None:
-            views = [seen[arm] for seen in self._views[: length + 1]]
-            pixels = np.array([self._pictures.of(view) for view in views])
+            pixels = _drawn(self._pictures, [seen[arm] for seen in self._views[: length + 1]])
         return Episode(seed, states, actions, rewards, terminated, truncated, succeeded, pixels)
+
+
+def _drawn(pictures: Pictures, views: Sequence[View]) -> NDArray[np.uint8]:
+    """The pictures of views (T, height, width, 3), each drawn into its place: two copies of all would be large."""
+    first = pictures.of(views[0])
+    drawn = np.empty((len(views), *first.shape), np.uint8)
+    drawn[0] = first
+    for index, view in enumerate(views[1:], start=1):
+        drawn[index] = pictures.of(view)
+    return drawn
 
 
 def _column(values: Sequence[Any], arm: int) -> Any:

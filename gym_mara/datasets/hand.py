@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import closing
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,7 @@ class HandViewer(Viewer):
         self._straight = StraightActions(simulation)
         self._touched = False
         self._keep: bool | None = None
+        self._interrupted = False
         super().__init__(simulation, settings)
         self._panel.backends.disabled = True  # a data set has one environment
         gui = self._server.gui
@@ -69,12 +72,20 @@ class HandViewer(Viewer):
 
         Returns:
             The episode; None if the user has discarded it.
+
+        Raises:
+            KeyboardInterrupt: after `interrupt`, unless the user has saved or discarded the episode before.
         """
         simulation = self._simulation
+        if not simulation.task.random_goal:  # the user may have dragged the target
+            first = simulation.episodes.first_goal
+            simulation.set_goal(first.position[0], first.quaternion[0])
         observation, _ = simulation.reset()
         self._rest()
         steps, ended = Steps(simulation, simulation.present(observation), pictures), False
         while self._keep is None:
+            if self._interrupted:
+                raise KeyboardInterrupt
             if ended or not self._touched or len(steps) == MOST_STEPS:
                 self._wait()
                 continue
@@ -121,6 +132,12 @@ class HandViewer(Viewer):
         for client in self._server.get_clients().values():
             with sender_errors_ignored():
                 client.add_notification(text, "")
+
+    def interrupt(self) -> None:
+        """Let `episode` raise KeyboardInterrupt, also while the user has paused; a handler of signals may call this."""
+        self._interrupted = self._playing = (
+            True  # without a lock, which the interrupted code may hold
+        )
 
     # The methods from here on run in viser's threads: they store requests.
 
@@ -169,7 +186,7 @@ def record_by_hand(
     Raises:
         GymMaraError: as in `recorder`; a value is out of its range, or the viewer cannot open.
         MissingExtraError: a library is not installed.
-        KeyboardInterrupt: no episode was saved.
+        KeyboardInterrupt: no episode was saved before Ctrl-C.
     """
     writer_class(form)  # an error comes before the viewer
     arms = make_vector_env(env, 1, backend=backend, **options)
@@ -186,18 +203,36 @@ def record_by_hand(
             first = first_view(simulation)
             pictures = Pictures(simulation.robot, contents.pictures, first)
         simulation.streams = (Streams.seeded(seed),)
-        with recorder(form, folder, contents) as (add, recorded):
-            viewer = HandViewer(simulation, simulation.options.rendering)
+        viewer = HandViewer(simulation, simulation.options.rendering)
+        with (
+            _interrupts_call(viewer.interrupt),
+            closing(viewer),
+            recorder(form, folder, contents) as (add, recorded),
+        ):
             log(f"{viewer.url}: {_HELP}")
-            with closing(viewer):
-                while recorded.episodes < episodes:
-                    try:
-                        episode = viewer.episode(pictures)
-                    except KeyboardInterrupt:
-                        if recorded.episodes:
-                            break
-                        raise
-                    if episode is not None:
-                        add(episode)
-                    viewer.notify(f"{recorded.episodes} of {episodes} episodes are saved")
+            while recorded.episodes < episodes:
+                try:
+                    episode = viewer.episode(pictures)
+                except KeyboardInterrupt:
+                    if recorded.episodes:
+                        break
+                    raise
+                if episode is not None:
+                    add(episode)
+                viewer.notify(f"{recorded.episodes} of {episodes} episodes are saved")
     return recorded
+
+
+@contextmanager
+def _interrupts_call(handle: Callable[[], None]) -> Iterator[None]:
+    """Call a function at Ctrl-C, which then interrupts nothing. Where Ctrl-C is ignored, and in other threads, nothing changes."""
+    before = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or not callable(before):
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: handle())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

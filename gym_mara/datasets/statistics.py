@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -34,10 +35,40 @@ def of_values(values: NDArray[Any]) -> Statistics:
 def of_pictures(pictures: NDArray[np.uint8]) -> Statistics:
     """The statistics of the channels of pictures (T, height, width, 3), in [0, 1], each (3, 1, 1)."""
     count = min(len(pictures), _MOST_PICTURES)
-    chosen = pictures[np.linspace(0, len(pictures) - 1, count).astype(int)]
-    found = of_values(chosen.reshape(-1, 3) / 255.0)
-    shaped = {name: values.reshape(-1, 1, 1) for name, values in found.items()}
+    counts = np.zeros((3, 256), np.int64)
+    for index in np.linspace(0, len(pictures) - 1, count).astype(int):
+        for channel in range(3):
+            values = pictures[index, ..., channel].reshape(-1)
+            counts[channel] += np.bincount(values, minlength=256)
+    of_channels = [_of_counts(each) for each in counts]
+    shaped = {
+        name: np.array([found[name] for found in of_channels]).reshape(3, 1, 1)
+        for name in of_channels[0]
+    }
     return shaped | {"count": np.array([count])}
+
+
+def _of_counts(counts: NDArray[np.int64]) -> dict[str, float]:
+    """The statistics of values in 0, 1/255, …, 1, from how often there is each (256,): the values themselves would take much memory."""
+    levels = np.arange(256) / 255.0
+    until = np.cumsum(counts)
+    total = int(until[-1])
+    mean = float(counts @ levels / total)
+
+    def ranked(rank: int) -> float:
+        return float(levels[np.searchsorted(until, rank, side="right")])
+
+    found = {
+        "min": ranked(0),
+        "max": ranked(total - 1),
+        "mean": mean,
+        "std": math.sqrt(counts @ (levels - mean) ** 2 / total),
+    }
+    for name, share in QUANTILES.items():  # linear between two ranks, as in `np.quantile`
+        place = share * (total - 1)
+        low, high = ranked(math.floor(place)), ranked(math.ceil(place))
+        found[name] = low + (place - math.floor(place)) * (high - low)
+    return found
 
 
 def merged(first: Statistics, second: Statistics) -> Statistics:

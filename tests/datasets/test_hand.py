@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +13,11 @@ import minari
 import numpy as np
 import pytest
 
+from gym_mara.datasets.episode import Steps
 from gym_mara.datasets.hand import HandViewer, record_by_hand
+from gym_mara.datasets.minari import MinariWriter
 from gym_mara.datasets.recorder import Recorded
+from gym_mara.envs import make_vector_env
 from gym_mara.testing import COLLIDING_Q
 from gym_mara.viewer.viewer import Viewer
 from tests.helpers import TARGET_Q, Cli, robot_model
@@ -122,6 +128,74 @@ def test_a_discarded_episode_is_not_recorded(user: User, tmp_path: Path) -> None
     assert recorded.episodes == 1, "Ctrl-C ends the recording, and keeps what was saved"
     [episode] = data.iterate_episodes()
     assert episode.observations[-1, 0] < -0.1
+
+
+@pytest.mark.parametrize(
+    ("owner", "method", "saved"),
+    [
+        (Steps, "episode", 1),  # Save was clicked, and the pictures are drawn
+        (MinariWriter, "add", 1),
+        (HandViewer, "notify", 1),
+        (MinariWriter, "finish", 2),
+        (HandViewer, "close", 2),
+    ],
+)
+def test_an_interrupt_at_any_time_keeps_what_was_saved(
+    user: User,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    owner: Any,
+    method: str,
+    saved: int,
+) -> None:
+    undisturbed = getattr(owner, method)
+
+    def interrupted(*arguments: Any) -> Any:
+        for _ in range(2):  # an impatient user
+            signal.raise_signal(signal.SIGINT)
+        return undisturbed(*arguments)
+
+    monkeypatch.setattr(owner, method, interrupted)
+    user.acts = {0: slide(0, 0.6), 9: press("save"), 12: slide(0, 0.6), 19: press("save")}
+    before = signal.getsignal(signal.SIGINT)
+    recorded, data = demonstrate(tmp_path)
+    assert recorded.episodes == data.total_episodes == saved
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_ends_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(make_vector_env("MARAReach-v0", 1, backend="pinocchio", **OPTIONS)) as arms:
+        arms.reset(seed=0)
+        viewer = HandViewer(arms.simulation, arms.simulation.options.rendering)
+        monkeypatch.setattr(viewer._server, "get_clients", lambda: {0: None})
+        viewer.set_playing(False)
+        interrupt = threading.Timer(0.2, viewer.interrupt)
+        interrupt.start()
+        with pytest.raises(KeyboardInterrupt):
+            viewer.episode(None)
+        interrupt.join()
+        monkeypatch.undo()
+        viewer.close()
+
+
+def test_a_dragged_target_of_a_task_with_a_fixed_one_lasts_for_an_episode(
+    user: User, tmp_path: Path
+) -> None:
+    goals: list[Any] = []
+
+    def save(viewer: Any) -> None:
+        goals.append(viewer._simulation.goal.position[0])
+        press("save")(viewer)
+
+    user.acts = {0: drag(*OPTIONS["start_q"]), 9: save, 12: slide(0, 0.6), 19: save}
+    _, data = demonstrate(tmp_path, env="MARA-v0")
+    env = data.recover_environment()
+    first, observed = env.reset()[0], [e.observations[0] for e in data.iterate_episodes()]
+    own = env.unwrapped.simulation.goal.position[0]
+    env.close()
+    assert np.abs(goals[0] - own).max() > 0.1
+    np.testing.assert_allclose(goals[1], own, atol=1e-12)
+    np.testing.assert_allclose(observed, [first, first], atol=1e-9)
 
 
 def test_a_save_before_the_first_move_records_nothing(user: User, tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ import itertools
 import os
 import subprocess
 import sys
+import tracemalloc
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,16 @@ from gym_mara.agents.evaluation.episodes import episode_seeds
 from gym_mara.agents.evaluation.rollout import Act
 from gym_mara.datasets import formats, playing, recorder, sources
 from gym_mara.datasets.contents import Contents
-from gym_mara.datasets.episode import Episode
+from gym_mara.datasets.episode import Episode, Steps
 from gym_mara.datasets.formats import FORMATS
 from gym_mara.datasets.playing import record, recording_seeds
 from gym_mara.datasets.recorder import Recorded
-from gym_mara.envs import MaraEnv, MaraGoalEnv
+from gym_mara.envs import MaraEnv, MaraGoalEnv, make_vector_env
 from gym_mara.envs.simulation import Simulation
+from gym_mara.envs.view import first_view
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS
+from gym_mara.rendering import Pictures, RenderSettings
 from gym_mara.testing import COLLIDING_Q
 from tests.helpers import Cli
 
@@ -163,6 +167,30 @@ def test_pictures_show_the_observations(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_array_equal(env.render(), pictures[-1])
     env.close()
     assert (pictures[0] != pictures[-1]).any()
+
+
+def test_the_pictures_of_an_episode_are_held_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(make_vector_env("MARA-v0", 1, backend="pinocchio")) as arms:
+        simulation = arms.simulation
+        observation, _ = arms.reset(seed=0)
+        settings = RenderSettings(width=64, height=64)
+        pictures = Pictures(simulation.robot, settings, first_view(simulation))
+        monkeypatch.setattr(pictures, "of", lambda view: np.full((64, 64, 3), 7, np.uint8))
+        steps, action = Steps(simulation, observation, pictures), np.zeros((1, 6), np.float32)
+        for _ in range(LENGTH):
+            arms.step(action)
+            assert simulation.outcome is not None
+            steps.add(observation, action, simulation.outcome, np.zeros(1, np.bool_))
+        tracemalloc.start()
+        try:
+            episode = steps.episode(0, LENGTH, None)
+            most = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+    assert episode.pixels is not None
+    assert episode.pixels.shape == (LENGTH + 1, 64, 64, 3)
+    assert (episode.pixels == 7).all()
+    assert most < 1.5 * episode.pixels.nbytes
 
 
 @pytest.mark.parametrize("pixels", [33, 30, 514])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -24,6 +25,9 @@ from gym_mara.errors import GymMaraError
 from gym_mara.rendering.camera import VIEW_ANGLE, place_camera
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.settings import CHANNELS, RenderSettings
+from gym_mara.robot import RobotModel
+from tests.helpers import write
+from tests.robot import arms
 
 SMALL: dict[str, Any] = {"pixel_size": 32, "max_joint_velocity": 1.5}
 ALL: dict[str, Any] = {**SMALL, "observation": "state+pixels", "pixel_channels": CHANNELS}
@@ -199,6 +203,43 @@ def test_depth_and_segments_are_those_of_known_points() -> None:
     space: Any = env.single_observation_space
     assert depths.max() == space["depth"].high.max()
     env.close()
+
+
+def test_a_camera_that_looks_at_a_point_before_it_sees_the_arm_nearer_than_the_background() -> None:
+    eye = np.array([6.0, 0.0, 1.0])
+    seen: list[Any] = []
+    for at in (np.array([0.0, 0.0, 0.7]), eye + 0.01 * np.array([-6.0, 0.0, -0.3])):
+        camera = {"pixel_camera": [eye.tolist(), at.tolist()], "pixel_channels": CHANNELS[1:]}
+        env = MaraEnv("MARAReach-v0", robot="ur5", **{**ALL, **camera, "pixel_size": 64})
+        seen.append(env.reset(seed=0)[0])
+        env.close()
+    on_arm = seen[0]["segmentation"] > 1
+    np.testing.assert_array_equal(seen[1]["segmentation"] > 1, on_arm)
+    np.testing.assert_allclose(seen[1]["depth"][on_arm], seen[0]["depth"][on_arm], atol=1e-5)
+
+
+def test_a_link_may_have_the_name_of_a_frame(tmp_path: Path) -> None:
+    """It is another segment than the frame, and does not carry the camera on the tool."""
+    shape = '<visual><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.2"/></geometry></visual>'
+    seen: list[Any] = []
+    names: list[tuple[str, ...]] = []
+    for name in ("hand", "tool"):
+        text = arms.arm(
+            collision=f"{arms.COLLISION}{shape}", more=f'<link name="{name}">{shape}</link>'
+        )
+        text = text.replace('<link name="tool"/>', "").replace(
+            '<child link="tool"/>', f'<child link="{name}"/>'
+        )
+        robot = RobotModel.load(str(write(tmp_path / f"{name}.urdf", text)), ee_frame="l2")
+        env = MaraEnv("MARAReach-v0", robot=robot, pixel_camera="tool", **ALL)
+        seen.append(env.reset(seed=0)[0])
+        assert env.simulation.pixels is not None
+        names.append(env.simulation.pixels.segments)
+        env.close()
+    _equal(*seen)
+    assert [name.replace("hand", "tool") for name in names[0]] == list(names[1])
+    assert names[1][-2:] == ("target", "tool")
+    assert names[1].count("tool") == 2
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def errors(episodes: Episodes) -> go.Figure:
 def joints(episodes: Episodes, robot: RobotModel) -> go.Figure:
     """Each joint's position against time, with its limits as dashed lines."""
     values = [episode.played.q[:, 0] for episode in episodes]
-    return _by_joint(episodes, values, robot, (robot.lower, robot.upper), "rad")
+    return _by_joint(episodes, values, robot, (robot.lower, robot.upper), ("rad", "m"))
 
 
 def torques(episodes: Episodes, robot: RobotModel) -> go.Figure | None:
@@ -101,7 +101,8 @@ def torques(episodes: Episodes, robot: RobotModel) -> go.Figure | None:
     if not simulated:
         return None
     values = [episode.played.torque[:, 0] for episode in simulated]
-    return _by_joint(simulated, values, robot, (-robot.effort_limit, robot.effort_limit), "Nm")
+    limits = -robot.effort_limit, robot.effort_limit
+    return _by_joint(simulated, values, robot, limits, ("Nm", "N"))
 
 
 def path(episodes: Episodes, target: Floats) -> go.Figure:
@@ -146,20 +147,30 @@ def _by_joint(
     values: Sequence[Floats],
     robot: RobotModel,
     limits: tuple[Floats, Floats],
-    unit: str,
+    units: tuple[str, str],
 ) -> go.Figure:
-    """A subplot for each joint, three in a row: values (T, J) of each episode, and the lower and upper limits (J,)."""
+    """A subplot for each joint, three in a row.
+
+    Args:
+        episodes: E.
+        values: of each episode (T, J).
+        robot: the arm.
+        limits: the lower and the upper ones (J,).
+        units: of the values of a joint that turns, and of one that slides.
+    """
     rows = -(-robot.num_joints // 3)
     figure = make_subplots(rows=rows, cols=3, subplot_titles=robot.joint_names, shared_xaxes=True)
+    sliding = robot.kinematics().prismatic
     for joint in range(robot.num_joints):
         place = {"row": 1 + joint // 3, "col": 1 + joint % 3}
         for number, (episode, of_joints) in enumerate(zip(episodes, values, strict=True)):
             figure.add_scatter(**_line(number, episode, of_joints[:, joint], joint == 0), **place)
         for limit in limits:
             figure.add_hline(limit[joint], line=_LIMIT, **place)
+        if joint % 3 == 0 or sliding[joint] != sliding[joint - 1]:
+            figure.update_yaxes(title=units[int(sliding[joint])], **place)
     figure.update_xaxes(range=_until_settled(episodes))
     figure.update_xaxes(title="s", row=rows)
-    figure.update_yaxes(title=unit, col=1)
     figure.update_layout(height=240 * rows + 80)
     return figure
 

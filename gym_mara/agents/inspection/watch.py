@@ -35,8 +35,8 @@ class Show:
 
     backend: str
     """That of the training, or the default one if that does not work here."""
-    play: Callable[[str, dict[str, Any]], Playing]
-    """Makes what plays it on a backend, with more keyword arguments of the environment.
+    play: Callable[[str, dict[str, Any], str], Playing]
+    """Makes what plays it on a backend, with more keyword arguments of the environment, and with an autoreset mode (see `Playing`).
 
     It raises GymMaraError if the policy is missing or damaged or does not fit, or if an option is unknown or out of range.
     """
@@ -45,8 +45,9 @@ class Show:
 def show_run(run: RunFolder, which: str = "last") -> Show:
     """Shows a policy of a run, "last" or "best"."""
 
-    def play(backend: str, options: dict[str, Any]) -> Playing:
-        return Player(run, backend, options_on(backend, run.config, options), which=which)
+    def play(backend: str, options: dict[str, Any], mode: str) -> Playing:
+        settings = options_on(backend, run.config, options)
+        return Player(run, backend, settings, which=which, autoreset_mode=mode)
 
     return Show(run.config.backend, play)
 
@@ -54,10 +55,11 @@ def show_run(run: RunFolder, which: str = "last") -> Show:
 def show_exported(policy: OnnxPolicy, env: str | None = None) -> Show:
     """Shows an exported policy in an environment of this name; by default that of its training."""
 
-    def play(backend: str, options: dict[str, Any]) -> Playing:
+    def play(backend: str, options: dict[str, Any], mode: str) -> Playing:
         keywords = policy.keywords(env, backend, **options)
         backend = keywords.pop("backend")
-        return Playing(env or policy.about.env, backend, keywords, begin_exported(policy))
+        name, begin = env or policy.about.env, begin_exported(policy)
+        return Playing(name, backend, keywords, begin, autoreset_mode=mode)
 
     return Show(backend_of(policy.about), play)
 
@@ -75,6 +77,7 @@ def film_episode(
 ) -> None:
     """Film the start of an episode of a policy on each backend, side by side.
 
+    An arm whose episode ends before the film, such as by a collision, is shown there until the end of the film.
     Joints that would teleport move at the robot's velocity limit, unless the run or the options have max_joint_velocity.
 
     Args:
@@ -88,36 +91,62 @@ def film_episode(
         log: is called with a sentence about each backend whose joints get the velocity limit.
 
     Raises:
-        GymMaraError: the file exists or cannot be written, or the policy cannot be shown (see `Show`).
+        GymMaraError: the file exists or cannot be written, the policy cannot be shown (see `Show`), or the control periods of the
+            backends differ.
     """
     check_film_path(path)  # an error comes before the policy is played
     with ExitStack() as stack:
         players, labels = [], []
         for backend in backends:
-            player = stack.enter_context(_filmed(show, backend, options, log))
+            player = stack.enter_context(_filmed(show, backend, options, "Disabled", log))
             limit = player.options.get(VELOCITY_LIMIT)
             players.append(player)
             labels.append(backend if limit is None else f"{backend}, at most {limit:.3g} rad/s")
-        period = players[0].env.simulation.backend.control_period
+        period = _control_period(players, backends)
         every = math.ceil(speed / period / rate)
         film = stack.enter_context(Film(path, speed / period / every))
         start = _side_by_side(players, labels)
         for _ in range(math.ceil(_STILL * speed / period / every)):
             film.add(start)
+        running = players
         for step in range(1, math.ceil(seconds / period) + 1):
-            for player in players:
-                player.step()
+            running = [player for player in running if not _has_ended(player.step())]
             if step % every == 0:
                 film.add(_side_by_side(players, labels))
 
 
 def _filmed(
-    show: Show, backend: str, options: dict[str, Any], log: Callable[[str], None] | None
+    show: Show,
+    backend: str,
+    options: dict[str, Any],
+    autoreset_mode: str,
+    log: Callable[[str], None] | None,
 ) -> Playing:
     """What plays a policy, with pictures and with joints that travel."""
-    return show.play(
-        backend, _travelling(show, backend, options, log) | {"render_mode": "rgb_array"}
-    )
+    travelling = _travelling(show, backend, options, log)
+    return show.play(backend, travelling | {"render_mode": "rgb_array"}, autoreset_mode)
+
+
+def _control_period(players: list[Playing], backends: list[str]) -> float:
+    """The control period of all players, s.
+
+    Raises:
+        GymMaraError: they differ.
+    """
+    periods = [player.env.simulation.backend.control_period for player in players]
+    for backend, period in zip(backends, periods, strict=True):
+        if period != periods[0]:
+            raise GymMaraError(
+                f"a film of several backends steps them together, and a step lasts {periods[0]:g} s on {backends[0]}, and "
+                f"{period:g} s on {backend}: film them one by one, or set control_period"
+            )
+    return periods[0]
+
+
+def _has_ended(outcome: Outcome) -> bool:
+    """Whether an episode without a time limit has ended: by the task, or because the state of the arm diverged."""
+    diverged = outcome.truncated is not None and outcome.truncated[0]
+    return bool(outcome.terminated[0] or diverged)
 
 
 def _side_by_side(players: list[Playing], labels: list[str]) -> Any:
@@ -157,7 +186,8 @@ def film_targets(
         raise GymMaraError(
             "a film of several targets puts an arm that collides back to its start: leave out on_collision"
         )
-    with _filmed(show, backend, {**options, "on_collision": "reset"}, log) as player:
+    given = {**options, "on_collision": "reset"}
+    with _filmed(show, backend, given, "SameStep", log) as player:
         simulation = player.env.simulation
         if not simulation.task.random_goal:
             raise GymMaraError(
@@ -257,7 +287,7 @@ def watch_run(
         GymMaraError: the policy is missing or damaged, a value is out of its range, or the viewer cannot open.
     """
     show = show_run(run, which)
-    with show.play(backend, _travelling(show, backend, options, log)) as player:
+    with show.play(backend, _travelling(show, backend, options, log), "SameStep") as player:
         begin, settings = player.begin, player.options
     watch(run.config.env, backend, settings, begin, speed=speed, seed=run.config.seed)
 
@@ -266,7 +296,7 @@ def _travelling(
     show: Show, backend: str, options: dict[str, Any], log: Callable[[str], None] | None
 ) -> dict[str, Any]:
     """The options with which a policy is shown: joints that would teleport travel, unless VELOCITY_LIMIT is given."""
-    with show.play(backend, options) as player:
+    with show.play(backend, options, "SameStep") as player:
         limit = None if VELOCITY_LIMIT in player.options else player.velocity_limit
     if limit is None:
         return options

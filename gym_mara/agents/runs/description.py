@@ -211,15 +211,16 @@ class PolicyDescription(_Description):
 
         Args:
             backend: the name of the backend.
-            options: those of the policy's run or given by the user. The steps of the policy are added, and its control
-                period, because they are made for it.
+            options: those of the policy's run or given by the user. The control period of the policy is added, and the steps
+                that are made for it, but for absolute actions.
         """
         own = self.action
-        if own.mode == "absolute" or options.get("action", own.mode) != own.mode:
+        if options.get("action", own.mode) != own.mode:
             return options  # `check` says what does not fit
-        period = {"control_period": self.control_period}
+        steps = {} if own.mode == "absolute" else own.keywords
         known = "control_period" in backend_settings(backend)
-        return own.keywords | (period if known else {}) | options
+        period = {"control_period": self.control_period} if known else {}
+        return steps | period | options
 
 
 def read_description(folder: Path) -> PolicyDescription:

@@ -79,13 +79,22 @@ class Playing:
         options: keyword arguments of the environment.
         begin: what acts; it refuses a simulation that the policy does not fit.
         arms: N.
+        autoreset_mode: "SameStep" begins the next episode in the step that ends one; with "Disabled" the arm stays where an
+            episode has ended, and the next step is an error.
 
     Raises:
         GymMaraError: the policy does not fit the environment, or an option is unknown or out of range.
     """
 
     def __init__(
-        self, env: str, backend: str, options: dict[str, Any], begin: Begin, arms: int = 1
+        self,
+        env: str,
+        backend: str,
+        options: dict[str, Any],
+        begin: Begin,
+        *,
+        arms: int = 1,
+        autoreset_mode: str = "SameStep",
     ) -> None:
         self.env_name = env
         """The name of the environment."""
@@ -94,7 +103,9 @@ class Playing:
         self.options = options
         """The keyword arguments of the environment."""
         self._begin = begin
-        self.env = make_arms(env, backend, arms, options, max_episode_steps=None)
+        self.env = make_arms(
+            env, backend, arms, options, autoreset_mode=autoreset_mode, max_episode_steps=None
+        )
         try:
             self._observation, _ = self.env.reset(seed=episode_seeds(0, 0, arms))
             self._act = self.begin(self.env.simulation)
@@ -138,7 +149,7 @@ class Player(Playing):
         backend: the backend.
         options: keyword arguments of the environment, from `options_on`; the policy's action mode and steps are added.
         which: the policy, "last" or "best".
-        arms: N.
+        arms, autoreset_mode: as in `Playing`.
 
     Raises:
         GymMaraError: the policy is missing, damaged or of another environment or robot, or an option is unknown or out of range.
@@ -152,6 +163,7 @@ class Player(Playing):
         *,
         which: str = "last",
         arms: int = 1,
+        autoreset_mode: str = "SameStep",
     ) -> None:
         self.policy = policy = load_policy(run, which)
 
@@ -160,7 +172,9 @@ class Player(Playing):
             return policy.begin(simulation)
 
         keywords = policy.about.keywords(backend, options)
-        super().__init__(run.config.env, backend, keywords, begin, arms)
+        super().__init__(
+            run.config.env, backend, keywords, begin, arms=arms, autoreset_mode=autoreset_mode
+        )
 
 
 def evaluate_run(

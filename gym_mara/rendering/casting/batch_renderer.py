@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from gym_mara.errors import GymMaraError
-from gym_mara.rendering.camera import VIEW_ANGLE, place_camera
+from gym_mara.rendering.camera import VIEW_ANGLE, Camera, place_camera
 from gym_mara.rendering.casting.appearance import Appearance
 from gym_mara.rendering.casting.caster import Caster, Drawn
 from gym_mara.rendering.scene import Scene
@@ -56,19 +56,19 @@ class BatchRenderer:
             own = size * np.array(_TOOL_EYE), size * np.array(_TOOL_AT), np.array([1.0, 0.0, 0.0])
         # The camera's position, the point that it looks at, and its upward direction, in the world or in the tool's frame.
         self._placed = own
-        tool = next(i for i, part in enumerate(self._scene.parts) if part.link == "tool")
+        parts = self._scene.parts
+        tool = next(i for i, part in enumerate(parts) if part.marker and part.link == "tool")
         self._tool_body = int(self._scene.body_of_part[tool])
         self._on_body = self._scene.on_body[tool]
-        self._colours = np.array([part.colour for part in self._scene.parts])
-        self._marker = np.array([part.marker for part in self._scene.parts])
-        links = list(dict.fromkeys(part.link for part in self._scene.parts))
-        self.segments: tuple[str, ...] = ("nothing", "floor", *links)
-        """What each number of a segmentation stands for."""
+        self._colours = np.array([part.colour for part in parts])
+        self._marker = np.array([part.marker for part in parts])
+        seen = list(dict.fromkeys((part.link, part.marker) for part in parts))
+        self.segments: tuple[str, ...] = ("nothing", "floor", *(link for link, _ in seen))
+        """What each number of a segmentation stands for; the last two are the frames, also if a link has the name of one."""
         # Of the part indices from -2 on.
-        numbers = [0, 1, *(self.segments.index(part.link) for part in self._scene.parts)]
+        numbers = [0, 1, *(2 + seen.index((part.link, part.marker)) for part in parts)]
         self._segment_of_part = np.array(numbers, np.uint8)
-        away = np.linalg.norm(self._camera.eye - self._camera.at)
-        self.far = float(np.ceil(self._camera.floor_radius + away))
+        self.far = _farthest(self._camera, robot)
         """The largest depth, m: that of the background, too."""
         spaces: dict[str, Space[Any]] = {
             "rgb": Box(0, 255, (height, width, 3), np.uint8),
@@ -162,6 +162,13 @@ class BatchRenderer:
                 range(threads),
             )
             return Drawn._make(np.concatenate(values) for values in zip(*drawn, strict=True))
+
+
+def _farthest(camera: Camera, robot: RobotModel) -> float:
+    """A depth, whole m, beyond which is no part of the arm, and none of the floor where the camera looks at the arm."""
+    floor = camera.floor_radius + np.linalg.norm(camera.eye - camera.at)
+    arm = np.linalg.norm(camera.eye - camera.floor) + robot.extent
+    return float(np.ceil(max(floor, arm)))
 
 
 def _key(channel: str) -> str:

@@ -175,5 +175,5 @@ def turned(turns: Float32s, vectors: Float32s) -> Float32s:
 def boxes(bodies: Sequence[Body], poses: Floats) -> Floats:
     """The corners of the boxes around bodies, in the world (N, len(bodies), 8, 3), m."""
     chosen = poses[:, [body.number for body in bodies]]
-    corners = np.array([body.corners for body in bodies])
+    corners = np.array([body.corners for body in bodies]).reshape(-1, 8, 3)
     return np.matmul(corners, np.swapaxes(chosen[..., :3, :3], -1, -2)) + chosen[..., None, :3, 3]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from gym_mara.agents.inspection.report_figures import Episode, path
+from gym_mara.agents.inspection.report_figures import Episode, joints, path, torques
+from gym_mara.robot import RobotModel
 from tests.agents.evaluation.conftest import trajectory
 from tests.helpers import Floats
+from tests.robot.arms import arm, arm_file
 
 STEPS = 40
 PLOTLY_SPREAD = 2.5
@@ -38,3 +42,28 @@ def test_the_whole_path_and_the_target_are_within_axes_with_ticks(length: float)
     assert scene.aspectmode == "cube"
     np.testing.assert_allclose(lengths, lengths[0], rtol=1e-9, err_msg="one scale for all axes")
     assert 0.01 <= lengths[0] <= max(0.02, 1.5 * length)
+
+
+@pytest.mark.parametrize(
+    ("sliding", "positions", "efforts"),
+    [
+        ((), ["rad", None, None], ["Nm", None, None]),
+        (("j1", "j2", "j3"), ["m", None, None], ["N", None, None]),
+        (("j2",), ["rad", "m", "rad"], ["Nm", "N", "Nm"]),
+    ],
+)
+def test_joints_that_slide_have_their_own_units(
+    tmp_path: Path, sliding: tuple[str, ...], positions: list[str], efforts: list[str]
+) -> None:
+    text = arm()
+    for name in sliding:
+        text = text.replace(f'name="{name}" type="revolute"', f'name="{name}" type="prismatic"')
+    robot = RobotModel.load(str(arm_file(tmp_path, text)), ee_frame="tool")
+    zeros = np.zeros((STEPS, 1, 3))
+    of_joints = dict.fromkeys(("q", "qd", "torque", "action"), zeros)
+    limits = {"velocity_limit": robot.velocity_limit, "effort_limit": robot.effort_limit}
+    one = [Episode("dart", trajectory(tool=zeros, start=zeros[0], **of_joints, **limits))]
+    for figure, units in ((joints(one, robot), positions), (torques(one, robot), efforts)):
+        assert figure is not None
+        axes = figure.layout.yaxis, figure.layout.yaxis2, figure.layout.yaxis3
+        assert [axis.title.text for axis in axes] == units

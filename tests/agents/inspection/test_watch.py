@@ -24,8 +24,14 @@ import pytest
 from gym_mara.agents.inspection import report as report_module
 from gym_mara.agents.inspection import watch as watch_module
 from gym_mara.agents.inspection.report import write_report
-from gym_mara.agents.inspection.watch import film_episode, film_targets, show_run, watch_run
-from gym_mara.agents.runs.evaluation import Player
+from gym_mara.agents.inspection.watch import (
+    Show,
+    film_episode,
+    film_targets,
+    show_run,
+    watch_run,
+)
+from gym_mara.agents.runs.evaluation import Player, Playing
 from gym_mara.agents.runs.folder import RunFolder
 from gym_mara.agents.training.train import train
 from gym_mara.collision.coal import CoalChecker
@@ -101,6 +107,48 @@ def test_two_backends_are_filmed_side_by_side(
     assert names[:2] == ["pinocchio, at most 1.57 rad/s", "dart"]
     assert differing(start[scene, :160], start[scene, 160:]) < 0.001
     assert differing(shown[-1, scene, :160], shown[-1, scene, 160:]) > 0.0005
+
+
+def test_an_arm_whose_episode_ends_stays_where_it_is_until_the_end_of_the_film(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    acts = iter([2.5, 2.5, 0.3, 0.3])  # the first arm moves into the table; each arm is made twice
+    frames: list[Any] = []
+    add = Film.add
+
+    def play(backend: str, options: dict[str, Any], mode: str) -> Playing:
+        act = np.array([[0.0, next(acts), 0.0, 0.0, 0.0, 0.0]])
+        own = options | {"on_collision": "terminate"}
+        name = "MARARandomTarget-v0"
+        return Playing(name, backend, own, lambda _: lambda _: act, autoreset_mode=mode)
+
+    def noted(film: Film, picture: Any) -> None:
+        frames.append(picture)
+        add(film, picture)
+
+    monkeypatch.setattr(Film, "add", noted)
+    both = ["pinocchio", "pinocchio"]
+    film_episode(Show("pinocchio", play), tmp_path / "film.gif", both, SMALL, seconds=1.8, rate=5)
+    left, right = (np.array(frames)[3:, 20:, half] for half in (np.s_[:160], np.s_[160:]))
+    last = 0
+    while (left[last] != left[-1]).any():
+        last += 1
+    assert 3 < last < len(left) - 3, "the collision"
+    np.testing.assert_array_equal(left[last:], left[-1:].repeat(len(left) - last, axis=0))
+    red, other = (
+        (sides[-1, ..., 0] > 150) & (sides[-1, ..., 1:] < 100).all(-1) for sides in (left, right)
+    )
+    assert red.sum() > other.sum() + 100, "the links that touch"
+
+
+def test_a_film_shows_backends_of_one_control_period(tmp_path: Path) -> None:
+    def play(backend: str, options: dict[str, Any], mode: str) -> Playing:
+        own = options | {"control_period": {"pinocchio": 0.02, "mujoco": 0.1}[backend]}
+        return Playing("MARA-v0", backend, own, lambda _: lambda _: np.zeros((1, 6)))
+
+    with pytest.raises(GymMaraError, match=r"0.02 s on pinocchio, and 0.1 s on mujoco: film them"):
+        film_episode(Show("", play), tmp_path / "film.gif", ["pinocchio", "mujoco"], SMALL)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +273,12 @@ def test_joints_that_would_teleport_are_shown_travelling(
         watch_run(finished_run, backend, chosen, "last", 1.0, notes.append)
     watch_run(finished_run, "dart", {}, "last", 1.0, notes.append)
     lowest = pytest.approx(robot_model("mara").velocity_limit.min())
-    assert watched == [{"max_joint_velocity": lowest}, {"max_joint_velocity": None}, {}]
+    period = {"control_period": 0.02}
+    assert watched == [
+        period | {"max_joint_velocity": lowest},
+        period | {"max_joint_velocity": None},
+        period,
+    ]
     film_episode(
         show_run(finished_run),
         tmp_path / "a.gif",
@@ -248,6 +301,26 @@ def test_the_speed_of_a_film(
     properties = imageio.immeta(film, plugin="FFMPEG")
     assert properties["fps"] == pytest.approx(rate, rel=0.01)
     assert properties["duration"] == pytest.approx(0.5 + 1.2 / speed, abs=0.1)
+
+
+@pytest.mark.parametrize("rate", [15.0, 37.5, 40.0, 50.0])
+def test_a_gif_has_the_rate_that_was_asked_for(tmp_path: Path, rate: float) -> None:
+    count = 30
+    with Film(tmp_path / "film.gif", rate) as film:
+        for grey in range(count):
+            film.add(np.full((16, 16, 3), 8 * grey, np.uint8))
+    times = [imageio.immeta(tmp_path / "film.gif", index=i)["duration"] for i in range(count)]
+    assert sum(times) == pytest.approx(1000.0 * count / rate, abs=10)
+    assert max(times) - min(times) <= 10
+
+
+def test_a_gif_is_held_with_one_byte_for_a_point_until_it_is_written(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    with Film(tmp_path / "film.gif", 25.0) as film:
+        for _ in range(3):
+            film.add(picture)
+        assert sum(len(held.tobytes()) for held in film._writer._pictures) == 3 * 32 * 32
+    assert len(pictures(tmp_path / "film.gif")) == 1, "equal pictures are one that lasts longer"
 
 
 @pytest.mark.parametrize(

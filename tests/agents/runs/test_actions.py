@@ -103,6 +103,26 @@ def test_a_policy_in_python_acts_in_an_environment_with_its_keywords(run: RunFol
         env.step(action)  # type: ignore[arg-type]
 
 
+def test_a_policy_of_joint_targets_keeps_its_control_period_on_another_backend(
+    finished_run: RunFolder, tmp_path: Path
+) -> None:
+    path = Path(shutil.copytree(finished_run.path, tmp_path / "run"))
+    for file, changes in (
+        ("config.json", {"env_options": {"control_period": 0.1}}),
+        ("last/policy.json", {"control_period": 0.1}),
+    ):
+        content = json.loads((path / file).read_text())
+        (path / file).write_text(json.dumps(content | changes))
+    run = RunFolder.open(path)
+    for backend, options, period in (
+        ("pinocchio", {}, 0.1),
+        ("mujoco", {}, 0.1),
+        ("mujoco", {"control_period": 0.04}, 0.04),
+    ):
+        with Player(run, backend, options_on(backend, run.config, options)) as player:
+            assert player.env.simulation.backend.control_period == period
+
+
 def test_policies_of_the_first_format_act_with_joint_targets(
     finished_run: RunFolder, tmp_path: Path
 ) -> None:
