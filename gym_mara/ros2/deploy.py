@@ -54,7 +54,8 @@ class Deployment:
         policy: the policy.
         env: the name of an environment; None for that of the training.
         options: keyword arguments of the environment with the backend "ros2", which replace those of the training. Without
-            `slow_within` the steps of a policy shrink from 0.1 m on, where the training had less.
+            `slow_within` the steps of a policy shrink from 0.1 m on, where the training had less. `on_collision` is none of them: the
+            arm waits for an operator then, whatever the training had.
         log: is called with a line whenever what the arm does changes, and for each refused target; in a dry run also once a second
             with what would be sent.
 
@@ -75,8 +76,13 @@ class Deployment:
         if "slow_within" in task_keywords(name):
             trained = policy.about.training.env_options.get("slow_within", 0.0)
             options = {"slow_within": max(trained, _SLOW_WITHIN), **options}
-        keywords = policy.keywords(env, "ros2", **options)
-        keywords.setdefault("on_collision", "continue")
+        if "on_collision" in options:
+            raise GymMaraError(
+                "on_collision cannot be set where a policy is deployed: after a collision ahead the arm waits for an operator, who "
+                "resumes it; leave it out"
+            )
+        # "reset" would resume a stopped arm by itself.
+        keywords = {**policy.keywords(env, "ros2", **options), "on_collision": "continue"}
         self._checks = ThreadPoolExecutor(1, "gym_mara targets")
         self._arms = make_vector_env(name, 1, **keywords)
         self.simulation = simulation = self._arms.simulation
