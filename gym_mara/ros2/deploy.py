@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from gym_mara.ros2.link import RosLink
     from gym_mara.ros2.node import RosNode
 
-RESUME = "/gym_mara/resume"
-"""The service with which an operator lets a stopped arm move again."""
 _WINDOW = 1000
 """Over how many of the last actions their lateness is measured."""
 _WAIT = 0.05
@@ -89,6 +87,13 @@ class Deployment:
         assert isinstance(simulation.backend, Ros2Backend)
         self.backend: Ros2Backend = simulation.backend
         self._driver, self._clock = self.backend.driver, self.backend.clock
+        of_policy = self.backend.profile.of_policy
+        self.target_topic = of_policy("target")
+        """The topic of targets."""
+        self.stop_service = of_policy("stop")
+        """The service that stops the arm."""
+        self.resume_service = of_policy("resume")
+        """The service with which an operator lets a stopped arm move again."""
         simulation.streams = (Streams.of(np.random.default_rng(0)),)
         self.follows = simulation.task.random_goal
         """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
@@ -174,7 +179,9 @@ class Deployment:
             with self._lock:
                 self._next = asked
             if self._stopped:
-                self._log(f"the target is kept: the arm moves to it once {RESUME} is called")
+                self._log(
+                    f"the target is kept: the arm moves to it once {self.resume_service} is called"
+                )
 
     def check(self, target: Target) -> None:
         """Check a target.
@@ -239,7 +246,8 @@ class Deployment:
         status, _ = self._status
         if status != self._told:
             self._told = status
-            self._log(f"{status}; call {RESUME} to go on" if self._stopped else status)
+            go_on = f"; call {self.resume_service} to go on" if self._stopped else ""
+            self._log(f"{status}{go_on}")
 
     def _wait(self) -> None:
         self._clock.sleep_until(self._clock.now() + _WAIT)

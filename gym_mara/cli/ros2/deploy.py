@@ -57,7 +57,7 @@ def deploy(
         str | None,
         typer.Option(
             metavar=_TARGET,
-            help="The first target, m, in the world; others come on the topic /gym_mara/target.",
+            help="The first target, m, in the world; others come on the topic /gym_mara/target, after the namespace.",
         ),
     ] = None,
     profile: ProfileOption = "trajectory",
@@ -93,8 +93,8 @@ def deploy(
         "live": live,
     }
     with _exported(policy, env) as exported:
-        from gym_mara.ros2.deploy import RESUME, Deployment
-        from gym_mara.ros2.deploy_node import STOP, TARGET, DeployNode
+        from gym_mara.ros2.deploy import Deployment
+        from gym_mara.ros2.deploy_node import DeployNode
         from gym_mara.ros2.safety.filter import NO_EMERGENCY_STOP
 
         out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
@@ -112,12 +112,18 @@ def deploy(
             DeployNode(deployment, deployment.node, _note)
             if first is not None:
                 deployment.aim(first)
-            out.print(f"ready: targets on {TARGET}, services {STOP} and {RESUME}", soft_wrap=True)
+            out.print(f"ready: {_offered(deployment)}", soft_wrap=True)
             out.file.flush()
             with _table(deployment):
                 deployment.run(seconds)
     for name, value in deployment.diagnostics.rows():
         out.print(f"{name}: {value}", soft_wrap=True)
+
+
+def _offered(deployment: Deployment) -> str:
+    """What other nodes can use."""
+    services = f"services {deployment.stop_service} and {deployment.resume_service}"
+    return f"targets on {deployment.target_topic}, {services}"
 
 
 def _note(text: str) -> None:

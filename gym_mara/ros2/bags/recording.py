@@ -18,7 +18,7 @@ from gym_mara.robot import RobotModel
 from gym_mara.ros2 import messages
 from gym_mara.ros2.bags.bag import Bag, Recorder
 from gym_mara.ros2.bags.logs import STATE_TYPE
-from gym_mara.ros2.deploy_node import DIAGNOSTICS, TARGET
+from gym_mara.ros2.deploy_node import DIAGNOSTICS
 from gym_mara.ros2.link import DISCOVERY, installed
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import DESCRIPTION, Profile
@@ -68,7 +68,7 @@ def topics_of(profile: Profile) -> tuple[tuple[str, ...], tuple[str, ...]]:
     own, notes = installed(profile)
     if own.commands == "action":
         notes += (f"the goals of the action {own.command_topic} are on no topic: not recorded",)
-    return (*own.topics, TARGET, DIAGNOSTICS), notes
+    return (*own.topics, own.of_policy("target"), DIAGNOSTICS), notes
 
 
 def record(

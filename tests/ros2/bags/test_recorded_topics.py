@@ -44,7 +44,7 @@ def test_a_profile_records_the_topics_of_its_arm_alone(
     arguments = ["--profile", "forward", "--namespace", "left", "--seconds", "0.5"]
     code, output, error = gym_mara("ros2", "record", bag, *arguments)
     assert (code, error.count("note")) == (0, 0)
-    missing = "/left/forward_position_controller/commands, /gym_mara/target, /diagnostics"
+    missing = "/left/forward_position_controller/commands, /left/gym_mara/target, /diagnostics"
     assert f"not found: {missing}\n" in output
     assert "lack" not in output
     with Bag(bag) as read:
@@ -100,7 +100,8 @@ def test_states_of_control_msgs_are_recorded_where_they_are_installed(
 
 def test_the_goals_of_an_action_are_not_recorded() -> None:
     topics, notes = recording.topics_of(make_profile("action", namespace="left"))
-    assert topics == ("/left/joint_states", "/left/robot_description", *OF_A_POLICY)
+    policy = ("/left/gym_mara/target", "/diagnostics")
+    assert topics == ("/left/joint_states", "/left/robot_description", *policy)
     assert "follow_joint_trajectory are on no topic" in notes[0]
 
 
