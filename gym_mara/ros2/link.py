@@ -277,7 +277,7 @@ class RosLink:
         found = graph.subscribers(node, topic)
         if not found:
             problems.append(
-                f"nobody listens to {topic}: the controller is not active, or has another name or namespace "
+                f"nobody listens to {topic}: the controller is not loaded, or has another name or namespace "
                 "(ros2 control list_controllers)"
             )
         elif all(endpoint.type != wanted for endpoint in found):
