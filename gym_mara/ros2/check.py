@@ -14,22 +14,25 @@ from gym_mara.deploy.about import About
 from gym_mara.robot import RobotModel
 from gym_mara.robot.fingerprint import fingerprint
 from gym_mara.ros2 import graph, messages
+from gym_mara.ros2.joints import LATE, LATE_WINDOW
 from gym_mara.ros2.link import DISCOVERY, RosLink
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import Profile
+from gym_mara.ros2.safety import Watchdogs
 from gym_mara.types import Floats
 
 with needs_ros("the check of an arm"):
     from std_msgs.msg import Float64MultiArray
 
-SLOWEST = 10.0
-"""The lowest rate of states, Hz, without a policy."""
-LONGEST_GAP = 0.2
-"""The longest time between two states, s."""
+LONGEST_GAP = Watchdogs.state_age
+"""The longest time between two states, s: the safety filter stops the arm after a longer one."""
+SLOWEST = 2.0 / LONGEST_GAP
+"""The lowest rate of states, Hz; a policy may need a higher one."""
 CLOCKS_AGREE = (-0.005, 1.0)
 """The ages of states between which the clocks of sender and receiver agree, s."""
-CLOCK_ERROR = (0.1, 0.1)
-"""How much the clock of the sender may be slower or faster than real time: a part of it, and s in all, for late states."""
+CLOCK_ERROR = (0.6 * LATE / LATE_WINDOW, 0.02)
+"""How much the clock of the sender may be slower or faster than real time: a part of it, and s in all, for late states. With a clock
+that is slower by LATE / LATE_WINDOW, states are refused as late."""
 OLDEST = 0.1
 """The highest age of states, s, at the 95th percentile."""
 _WAITING = 3.0
@@ -168,7 +171,7 @@ def _of_states(
         return lines, {"rate": 0.0}
     gaps = np.diff([arrival.received for arrival in arrivals])
     rate = len(gaps) / float(gaps.sum())
-    wanted = SLOWEST if about is None else 0.9 / about.control_period
+    wanted = SLOWEST if about is None else max(SLOWEST, 0.9 / about.control_period)
     figures: dict[str, Any] = {"rate": rate, "gaps": _percentiles(gaps)}
     lines += [
         Line(
@@ -225,8 +228,7 @@ def _clock_line(arrivals: list[_Arrival]) -> tuple[Line, list[float] | None]:
     stamps = np.array([arrival.stamp for arrival in arrivals])
     if not stamps.any():
         return Line(True, "clock", "the states have no stamps; their age is not known"), None
-    passed = arrivals[-1].received - arrivals[0].received
-    speed = float(stamps[-1] - stamps[0]) / passed
+    passed, speed = _clock_speed(arrivals)
     if abs(speed - 1.0) > CLOCK_ERROR[0] + CLOCK_ERROR[1] / passed:
         found = f"that of the sender runs at {speed:.3g} times real time"
         remedy = "it must advance in real time: start the clock or the simulation, or let it run at its speed"
@@ -244,6 +246,20 @@ def _clock_line(arrivals: list[_Arrival]) -> tuple[Line, list[float] | None]:
     side = "behind" if age[1] > 0.0 else "ahead of"
     found = f"that of the sender is {abs(age[1]):.3f} s {side} that of this machine"
     return Line(False, "clock", found, "set both by the same server of time (chrony)"), None
+
+
+def _clock_speed(arrivals: list[_Arrival]) -> tuple[float, float]:
+    """Over which time the sender's clock was measured, s, and how fast it runs, in times real time.
+
+    Late states count as little as possible: the fastest of the first and of the last third are compared.
+    """
+    third = -(-len(arrivals) // 3)
+    begin, end = (
+        min(some, key=lambda each: each.received - each.stamp)
+        for some in (arrivals[:third], arrivals[-third:])
+    )
+    passed = end.received - begin.received
+    return passed, (end.stamp - begin.stamp) / passed
 
 
 def _of_commands(link: RosLink) -> list[Line]:
