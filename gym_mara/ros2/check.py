@@ -14,7 +14,7 @@ from gym_mara.deploy.about import About
 from gym_mara.robot import RobotModel
 from gym_mara.robot.fingerprint import fingerprint
 from gym_mara.ros2 import graph, messages
-from gym_mara.ros2.joints import LATE, LATE_WINDOW
+from gym_mara.ros2.joints import LATE, LATE_WINDOW, UNKNOWN
 from gym_mara.ros2.link import DISCOVERY, RosLink
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import Profile
@@ -166,7 +166,7 @@ def _of_states(
     who = graph.described(found) or "nobody"
     lines = [Line(not problems, "states", f"{topic}, published by {who}", "; ".join(problems))]
     lines += [Line(True, "note", note) for note in link.notes]
-    arrivals = measured.arrivals
+    arrivals = _own(robot, measured.arrivals)
     if len(arrivals) < 2:
         return lines, {"rate": 0.0}
     gaps = np.diff([arrival.received for arrival in arrivals])
@@ -199,12 +199,19 @@ def _of_states(
     return lines, figures
 
 
+def _own(robot: RobotModel, arrivals: list[_Arrival]) -> list[_Arrival]:
+    """The messages with all joints of the robot, without those of others on the topic, such as a gripper; all, if none has them."""
+    own = [each for each in arrivals if set(robot.joint_names) <= set(each.names)]
+    return own or arrivals
+
+
 def _joints_line(robot: RobotModel, link: RosLink, arrivals: list[_Arrival]) -> Line:
-    names = arrivals[-1].names
-    refused = sum(link.refused.values())
+    names, refused = arrivals[-1].names, dict(link.refused)
+    if link.state is not None:
+        refused.pop(UNKNOWN, None)  # of others on the topic
     if refused:
-        why = ", ".join(f"{number} {reason}" for reason, number in link.refused.items())
-        found = f"{refused} states refused: {why}"
+        why = ", ".join(f"{number} {reason}" for reason, number in refused.items())
+        found = f"{sum(refused.values())} states refused: {why}"
         return Line(False, "joints", found, link.last_refusal or "")
     own = [name for name in names if name in robot.joint_names]
     order = "the order of the robot" if tuple(own) == robot.joint_names else "another order"

@@ -40,6 +40,7 @@ def arm(
     offset: float = 0.0,
     listens: bool = True,
     rival: bool = False,
+    gripper: bool = False,
 ) -> Iterator[None]:
     """An arm that publishes states with a clock of some speed, times real time, and an offset, s."""
     peer, ending = Peer("arm"), threading.Event()
@@ -56,6 +57,8 @@ def arm(
             now = began + offset + speed * (peer.ros.now() - began)
             message.header.stamp = messages.stamp(now)
             states.publish(message)
+            if gripper:
+                states.publish(JointState(header=message.header, name=["finger"], position=[0.0]))
 
     thread = threading.Thread(target=publish)
     thread.start()
@@ -87,6 +90,17 @@ def test_nothing_is_wrong_with_a_good_arm(ros_domain: int, mara: RobotModel) -> 
     assert texts["joints"] == "all 6, by name, in another order, and 1 others, which are ignored"
     assert "/arm (reliable, volatile)" in texts["states"]
     assert report.figures["latency"][0] >= about.control_period
+
+
+def test_the_states_of_a_gripper_on_the_same_topic_do_not_count(
+    ros_domain: int, mara: RobotModel
+) -> None:
+    with arm(gripper=True):
+        report = checked(mara)
+    assert set(wrong(report)) <= TIMES
+    assert report.figures["rate"] < 60.0
+    texts = {line.what: line.found for line in report.lines}
+    assert texts["joints"] == "all 6, by name, in the order of the robot"
 
 
 CASES: list[tuple[dict[str, Any], set[str], str]] = [
