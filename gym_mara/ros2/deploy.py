@@ -46,7 +46,8 @@ class Target(NamedTuple):
 
 
 class Deployment:
-    """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target.
+    """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target. It moves at once if the task
+    has a target of its own.
 
     Args:
         policy: the policy.

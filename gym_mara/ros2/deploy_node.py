@@ -59,11 +59,18 @@ class DeployNode:
         """The frames that do not move, in the world."""
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, messages.RELIABLE)
         self._own: list[Any] = [
-            node.create_subscription(PoseStamped, target, self._aim, messages.RELIABLE),
             node.create_service(Trigger, stop, self._stop),
             node.create_service(Trigger, resume, self._resume),
             node.create_timer(_EVERY, self._report),
         ]
+        what = "the task's own target, to which the arm moves at once"
+        if deployment.follows:
+            what = f"targets on {target}"
+            self._own.append(
+                node.create_subscription(PoseStamped, target, self._aim, messages.RELIABLE)
+            )
+        self.offered = f"{what}, services {stop} and {resume}"
+        """What there is for other nodes and operators, in words."""
 
     def _aim(self, message: Any) -> None:
         try:

@@ -68,3 +68,16 @@ def test_a_second_policy_with_the_same_services_does_not_start(
             GymMaraError, match=r"another node serves /gym_mara/(stop|resume) already"
         ):
             DeployNode(arms[1], two, print)
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_targets_are_taken_only_by_a_policy_that_follows_them(
+    deploy: Callable[..., Deployment], ros_domain: int, follows: bool
+) -> None:
+    arm = deploy()
+    arm.follows = follows
+    with closing(RosNode("one")) as node:
+        offered = DeployNode(arm, node, print).offered
+        assert bool(node.node.get_subscriptions_info_by_topic("/gym_mara/target")) == follows
+    assert ("targets on /gym_mara/target" in offered) == follows
+    assert ("moves at once" in offered) != follows

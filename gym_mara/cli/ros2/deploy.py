@@ -109,21 +109,15 @@ def deploy(
                 out.print(f"note: {note}.", soft_wrap=True)
             if first is not None:
                 deployment.check(first)
-            DeployNode(deployment, deployment.node, _note)
+            offered = DeployNode(deployment, deployment.node, _note).offered
             if first is not None:
                 deployment.aim(first)
-            out.print(f"ready: {_offered(deployment)}", soft_wrap=True)
+            out.print(f"ready: {offered}", soft_wrap=True)
             out.file.flush()
             with _table(deployment):
                 deployment.run(seconds)
     for name, value in deployment.diagnostics.rows():
         out.print(f"{name}: {value}", soft_wrap=True)
-
-
-def _offered(deployment: Deployment) -> str:
-    """What other nodes can use."""
-    services = f"services {deployment.stop_service} and {deployment.resume_service}"
-    return f"targets on {deployment.target_topic}, {services}"
 
 
 def _note(text: str) -> None:
