@@ -69,6 +69,20 @@ def test_states_of_another_robot_are_told_and_other_topics_are_recorded_too(
     assert row.split()[-2] == "0"
 
 
+def test_a_topic_needs_no_slash_and_those_that_are_not_there_are_noted(
+    peer: Peer, tmp_path: Path, gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "ABSENT", 0.5)
+    arm(peer, "/left")
+    arguments = ["--topic", "left/joint_states", "--topic", "missing", "--seconds", "1"]
+    code, output, error = gym_mara("ros2", "record", tmp_path / "bag", *arguments)
+    assert code == 0
+    assert error.count("note: not there yet: /missing.") == 1
+    assert "not found: /missing\n" in output
+    with Bag(tmp_path / "bag") as read:
+        assert len(list(read.messages(["/left/joint_states"]))) > 10
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
