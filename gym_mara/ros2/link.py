@@ -98,6 +98,7 @@ class RosLink:
         self.node = RosNode("gym_mara_link", domain=domain) if node is None else node
         self._publisher: Any = None
         self._client: Any = None
+        self._orders: dict[str, tuple[str, ...]] = {}
         self._action = action
         self._commands = commands
         self._connect(commands)
@@ -288,7 +289,22 @@ class RosLink:
             reason = graph.qos_problem(self._qos, endpoint.qos)
             if reason is not None:
                 problems.append(f"commands do not reach {endpoint.node}: {reason}")
+        if self.profile.commands == "positions":
+            problems += self._order_problems({endpoint.node for endpoint in found})
         return problems
+
+    def _order_problems(self, controllers: set[str]) -> list[str]:
+        """What is wrong with the order of the joints of controllers, of those that tell it."""
+        own = self.robot.joint_names
+        for each in controllers - self._orders.keys():
+            if (order := graph.joints_of(self.node.node, each)) is not None:
+                self._orders[each] = order
+        return [
+            f"{each} has the joints {', '.join(order)} in its parameter joints, and numbers for {', '.join(own)} would be sent: "
+            "give it the joints of the robot in this order, or choose another profile"
+            for each, order in self._orders.items()
+            if each in controllers and order != own
+        ]
 
     def close(self) -> None:
         """As in `Link`."""
