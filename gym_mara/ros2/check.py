@@ -272,8 +272,14 @@ def _clock_speed(arrivals: list[_Arrival]) -> tuple[float, float]:
 def _of_commands(link: RosLink) -> list[Line]:
     topic = link.profile.command_topic
     problems = link.command_problems()
-    who = graph.described(graph.subscribers(link.node.node, topic)) or "nobody"
-    return [Line(not problems, "commands", f"{topic}, heard by {who}", "; ".join(problems))]
+    who = graph.described(found := graph.subscribers(link.node.node, topic)) or "nobody"
+    lines = [Line(not problems, "commands", f"{topic}, heard by {who}", "; ".join(problems))]
+    silent = sorted({endpoint.node for endpoint in found} - link.orders.keys())
+    if silent and link.profile.commands == "positions":
+        own = ", ".join(link.robot.joint_names)
+        note = f"{', '.join(silent)} does not tell its joints: compare them, and their order, with {own}"
+        lines.append(Line(True, "note", note))
+    return lines
 
 
 def _of_policy(robot: RobotModel, about: About | None) -> list[Line]:

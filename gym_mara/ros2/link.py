@@ -98,7 +98,8 @@ class RosLink:
         self.node = RosNode("gym_mara_link", domain=domain) if node is None else node
         self._publisher: Any = None
         self._client: Any = None
-        self._orders: dict[str, tuple[str, ...]] = {}
+        self.orders: dict[str, tuple[str, ...]] = {}
+        """The joints that the controllers of positions tell, by their nodes; after `command_problems`."""
         self._action = action
         self._commands = commands
         self._connect(commands)
@@ -296,13 +297,13 @@ class RosLink:
     def _order_problems(self, controllers: set[str]) -> list[str]:
         """What is wrong with the order of the joints of controllers, of those that tell it."""
         own = self.robot.joint_names
-        for each in controllers - self._orders.keys():
+        for each in controllers - self.orders.keys():
             if (order := graph.joints_of(self.node.node, each)) is not None:
-                self._orders[each] = order
+                self.orders[each] = order
         return [
             f"{each} has the joints {', '.join(order)} in its parameter joints, and numbers for {', '.join(own)} would be sent: "
             "give it the joints of the robot in this order, or choose another profile"
-            for each, order in self._orders.items()
+            for each, order in self.orders.items()
             if each in controllers and order != own
         ]
 

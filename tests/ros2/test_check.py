@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from gym_mara.deploy import OnnxPolicy
@@ -101,6 +102,17 @@ def test_the_states_of_a_gripper_on_the_same_topic_do_not_count(
     assert report.figures["rate"] < 60.0
     texts = {line.what: line.found for line in report.lines}
     assert texts["joints"] == "all 6, by name, in the order of the robot"
+
+
+def test_a_controller_of_positions_that_does_not_tell_its_joints_is_noted(
+    ros_domain: int, mara: RobotModel, peer: Peer
+) -> None:
+    forward = make_profile("forward")
+    peer.heard(Float64MultiArray, forward.command_topic)
+    with arm():
+        report = check(mara, forward, seconds=0.5)
+    (note,) = (line.found for line in report.lines if line.what == "note")
+    assert "/peer does not tell its joints: compare them, and their order, with motor1" in note
 
 
 CASES: list[tuple[dict[str, Any], set[str], str]] = [

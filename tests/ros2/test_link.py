@@ -255,7 +255,7 @@ def test_a_controller_with_another_order_of_joints_is_found(
     order.reverse()
     link.close()
     other = links(mara, "forward")
-    eventually(lambda: not other.command_problems() and other._orders)
+    eventually(lambda: not other.command_problems() and other.orders)
 
 
 def test_a_quality_of_service_that_does_not_fit_is_found(
