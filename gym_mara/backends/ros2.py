@@ -93,7 +93,9 @@ class Ros2Backend(Backend):
         collision: str = "coal",
     ) -> None:
         super().__init__(robot, num_envs, control_period=control_period)
-        own = make_profile(profile, controller=controller, namespace=namespace).velocity
+        self.profile = make_profile(profile, controller=controller, namespace=namespace)
+        """How to speak to the arm."""
+        own = self.profile.velocity
         fastest = own if max_joint_velocity is None else max_joint_velocity
         limits = MotionLimits.of(robot, fastest, max_joint_acceleration, max_joint_jerk)
         self._limits, self.joint_velocity = limits, limits.velocity

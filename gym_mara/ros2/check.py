@@ -14,22 +14,25 @@ from gym_mara.deploy.about import About
 from gym_mara.robot import RobotModel
 from gym_mara.robot.fingerprint import fingerprint
 from gym_mara.ros2 import graph, messages
+from gym_mara.ros2.joints import LATE, LATE_WINDOW, UNKNOWN
 from gym_mara.ros2.link import DISCOVERY, RosLink
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import Profile
+from gym_mara.ros2.safety import Watchdogs
 from gym_mara.types import Floats
 
 with needs_ros("the check of an arm"):
     from std_msgs.msg import Float64MultiArray
 
-SLOWEST = 10.0
-"""The lowest rate of states, Hz, without a policy."""
-LONGEST_GAP = 0.2
-"""The longest time between two states, s."""
+LONGEST_GAP = Watchdogs.state_age
+"""The longest time between two states, s: the safety filter stops the arm after a longer one."""
+SLOWEST = 2.0 / LONGEST_GAP
+"""The lowest rate of states, Hz; a policy may need a higher one."""
 CLOCKS_AGREE = (-0.005, 1.0)
 """The ages of states between which the clocks of sender and receiver agree, s."""
-CLOCK_ERROR = (0.1, 0.1)
-"""How much the clock of the sender may be slower or faster than real time: a part of it, and s in all, for late states."""
+CLOCK_ERROR = (0.6 * LATE / LATE_WINDOW, 0.02)
+"""How much the clock of the sender may be slower or faster than real time: a part of it, and s in all, for late states. With a clock
+that is slower by LATE / LATE_WINDOW, states are refused as late."""
 OLDEST = 0.1
 """The highest age of states, s, at the 95th percentile."""
 _WAITING = 3.0
@@ -163,12 +166,12 @@ def _of_states(
     who = graph.described(found) or "nobody"
     lines = [Line(not problems, "states", f"{topic}, published by {who}", "; ".join(problems))]
     lines += [Line(True, "note", note) for note in link.notes]
-    arrivals = measured.arrivals
+    arrivals = _own(robot, measured.arrivals)
     if len(arrivals) < 2:
         return lines, {"rate": 0.0}
     gaps = np.diff([arrival.received for arrival in arrivals])
     rate = len(gaps) / float(gaps.sum())
-    wanted = SLOWEST if about is None else 0.9 / about.control_period
+    wanted = SLOWEST if about is None else max(SLOWEST, 0.9 / about.control_period)
     figures: dict[str, Any] = {"rate": rate, "gaps": _percentiles(gaps)}
     lines += [
         Line(
@@ -196,12 +199,19 @@ def _of_states(
     return lines, figures
 
 
+def _own(robot: RobotModel, arrivals: list[_Arrival]) -> list[_Arrival]:
+    """The messages with all joints of the robot, without those of others on the topic, such as a gripper; all, if none has them."""
+    own = [each for each in arrivals if set(robot.joint_names) <= set(each.names)]
+    return own or arrivals
+
+
 def _joints_line(robot: RobotModel, link: RosLink, arrivals: list[_Arrival]) -> Line:
-    names = arrivals[-1].names
-    refused = sum(link.refused.values())
+    names, refused = arrivals[-1].names, dict(link.refused)
+    if link.state is not None:
+        refused.pop(UNKNOWN, None)  # of others on the topic
     if refused:
-        why = ", ".join(f"{number} {reason}" for reason, number in link.refused.items())
-        found = f"{refused} states refused: {why}"
+        why = ", ".join(f"{number} {reason}" for reason, number in refused.items())
+        found = f"{sum(refused.values())} states refused: {why}"
         return Line(False, "joints", found, link.last_refusal or "")
     own = [name for name in names if name in robot.joint_names]
     order = "the order of the robot" if tuple(own) == robot.joint_names else "another order"
@@ -225,8 +235,7 @@ def _clock_line(arrivals: list[_Arrival]) -> tuple[Line, list[float] | None]:
     stamps = np.array([arrival.stamp for arrival in arrivals])
     if not stamps.any():
         return Line(True, "clock", "the states have no stamps; their age is not known"), None
-    passed = arrivals[-1].received - arrivals[0].received
-    speed = float(stamps[-1] - stamps[0]) / passed
+    passed, speed = _clock_speed(arrivals)
     if abs(speed - 1.0) > CLOCK_ERROR[0] + CLOCK_ERROR[1] / passed:
         found = f"that of the sender runs at {speed:.3g} times real time"
         remedy = "it must advance in real time: start the clock or the simulation, or let it run at its speed"
@@ -246,11 +255,31 @@ def _clock_line(arrivals: list[_Arrival]) -> tuple[Line, list[float] | None]:
     return Line(False, "clock", found, "set both by the same server of time (chrony)"), None
 
 
+def _clock_speed(arrivals: list[_Arrival]) -> tuple[float, float]:
+    """Over which time the sender's clock was measured, s, and how fast it runs, in times real time.
+
+    Late states count as little as possible: the fastest of the first and of the last third are compared.
+    """
+    third = -(-len(arrivals) // 3)
+    begin, end = (
+        min(some, key=lambda each: each.received - each.stamp)
+        for some in (arrivals[:third], arrivals[-third:])
+    )
+    passed = end.received - begin.received
+    return passed, (end.stamp - begin.stamp) / passed
+
+
 def _of_commands(link: RosLink) -> list[Line]:
     topic = link.profile.command_topic
     problems = link.command_problems()
-    who = graph.described(graph.subscribers(link.node.node, topic)) or "nobody"
-    return [Line(not problems, "commands", f"{topic}, heard by {who}", "; ".join(problems))]
+    who = graph.described(found := graph.subscribers(link.node.node, topic)) or "nobody"
+    lines = [Line(not problems, "commands", f"{topic}, heard by {who}", "; ".join(problems))]
+    silent = sorted({endpoint.node for endpoint in found} - link.orders.keys())
+    if silent and link.profile.commands == "positions":
+        own = ", ".join(link.robot.joint_names)
+        note = f"{', '.join(silent)} does not tell its joints: compare them, and their order, with {own}"
+        lines.append(Line(True, "note", note))
+    return lines
 
 
 def _of_policy(robot: RobotModel, about: About | None) -> list[Line]:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from gym_mara.ros2.link import RosLink
     from gym_mara.ros2.node import RosNode
 
-RESUME = "/gym_mara/resume"
-"""The service with which an operator lets a stopped arm move again."""
 _WINDOW = 1000
 """Over how many of the last actions their lateness is measured."""
 _WAIT = 0.05
@@ -48,13 +46,15 @@ class Target(NamedTuple):
 
 
 class Deployment:
-    """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target.
+    """A policy and the arm that it moves. The arm begins where it is, and rests until there is a target. It moves at once if the task
+    has a target of its own.
 
     Args:
         policy: the policy.
         env: the name of an environment; None for that of the training.
         options: keyword arguments of the environment with the backend "ros2", which replace those of the training. Without
-            `slow_within` the steps of a policy shrink from 0.1 m on, where the training had less.
+            `slow_within` the steps of a policy shrink from 0.1 m on, where the training had less. `on_collision` is none of them: the
+            arm waits for an operator then, whatever the training had.
         log: is called with a line whenever what the arm does changes, and for each refused target; in a dry run also once a second
             with what would be sent.
 
@@ -75,14 +75,26 @@ class Deployment:
         if "slow_within" in task_keywords(name):
             trained = policy.about.training.env_options.get("slow_within", 0.0)
             options = {"slow_within": max(trained, _SLOW_WITHIN), **options}
-        keywords = policy.keywords(env, "ros2", **options)
-        keywords.setdefault("on_collision", "continue")
+        if "on_collision" in options:
+            raise GymMaraError(
+                "on_collision cannot be set where a policy is deployed: after a collision ahead the arm waits for an operator, who "
+                "resumes it; leave it out"
+            )
+        # "reset" would resume a stopped arm by itself.
+        keywords = {**policy.keywords(env, "ros2", **options), "on_collision": "continue"}
         self._checks = ThreadPoolExecutor(1, "gym_mara targets")
         self._arms = make_vector_env(name, 1, **keywords)
         self.simulation = simulation = self._arms.simulation
         assert isinstance(simulation.backend, Ros2Backend)
         self.backend: Ros2Backend = simulation.backend
         self._driver, self._clock = self.backend.driver, self.backend.clock
+        of_policy = self.backend.profile.of_policy
+        self.target_topic = of_policy("target")
+        """The topic of targets."""
+        self.stop_service = of_policy("stop")
+        """The service that stops the arm."""
+        self.resume_service = of_policy("resume")
+        """The service with which an operator lets a stopped arm move again."""
         simulation.streams = (Streams.of(np.random.default_rng(0)),)
         self.follows = simulation.task.random_goal
         """Whether the task reaches for the targets of `aim`; otherwise it has one of its own."""
@@ -168,7 +180,9 @@ class Deployment:
             with self._lock:
                 self._next = asked
             if self._stopped:
-                self._log(f"the target is kept: the arm moves to it once {RESUME} is called")
+                self._log(
+                    f"the target is kept: the arm moves to it once {self.resume_service} is called"
+                )
 
     def check(self, target: Target) -> None:
         """Check a target.
@@ -233,7 +247,8 @@ class Deployment:
         status, _ = self._status
         if status != self._told:
             self._told = status
-            self._log(f"{status}; call {RESUME} to go on" if self._stopped else status)
+            go_on = f"; call {self.resume_service} to go on" if self._stopped else ""
+            self._log(f"{status}{go_on}")
 
     def _wait(self) -> None:
         self._clock.sleep_until(self._clock.now() + _WAIT)

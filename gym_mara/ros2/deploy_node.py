@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from gym_mara.errors import GymMaraError, finite_numbers, one_of
 from gym_mara.ros2 import messages
-from gym_mara.ros2.deploy import RESUME, Deployment, Target
+from gym_mara.ros2.deploy import Deployment, Target
 from gym_mara.ros2.diagnostics import Diagnostics
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.tasks.reach import check_unit
@@ -20,7 +20,6 @@ with needs_ros("a deployment"):
     from geometry_msgs.msg import PoseStamped
     from std_srvs.srv import Trigger
 
-TARGET, STOP = "/gym_mara/target", "/gym_mara/stop"
 DIAGNOSTICS = "/diagnostics"
 _EVERY = 1.0
 """How often diagnostics are published, s."""
@@ -33,11 +32,25 @@ class DeployNode:
         deployment: the deployment.
         ros: the node.
         log: is called with a sentence about each refused target.
+
+    Raises:
+        GymMaraError: another node serves the same stop or resume: one call would stop or resume two arms.
     """
 
     def __init__(self, deployment: Deployment, ros: RosNode, log: Callable[[str], None]) -> None:
         self._deployment, self._ros, self._log = deployment, ros, log
         node = ros.node
+        target, stop, resume = (
+            deployment.target_topic,
+            deployment.stop_service,
+            deployment.resume_service,
+        )
+        for service in (stop, resume):
+            if node.count_services(service):
+                raise GymMaraError(
+                    f"another node serves {service} already, so that one call would reach two arms: end the policy that is deployed "
+                    "there (one that was killed is forgotten after some seconds), or give each arm its own namespace or ROS domain"
+                )
         model = deployment.simulation.robot.model
         self._frames: dict[str, pin.SE3] = {
             "world": pin.SE3.Identity(),
@@ -46,11 +59,18 @@ class DeployNode:
         """The frames that do not move, in the world."""
         self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, messages.RELIABLE)
         self._own: list[Any] = [
-            node.create_subscription(PoseStamped, TARGET, self._aim, messages.RELIABLE),
-            node.create_service(Trigger, STOP, self._stop),
-            node.create_service(Trigger, RESUME, self._resume),
+            node.create_service(Trigger, stop, self._stop),
+            node.create_service(Trigger, resume, self._resume),
             node.create_timer(_EVERY, self._report),
         ]
+        what = "the task's own target, to which the arm moves at once"
+        if deployment.follows:
+            what = f"targets on {target}"
+            self._own.append(
+                node.create_subscription(PoseStamped, target, self._aim, messages.RELIABLE)
+            )
+        self.offered = f"{what}, services {stop} and {resume}"
+        """What there is for other nodes and operators, in words."""
 
     def _aim(self, message: Any) -> None:
         try:
@@ -64,7 +84,7 @@ class DeployNode:
 
     def _stop(self, _: Any, response: Any) -> Any:
         try:
-            self._deployment.stop(f"the service {STOP} was called")
+            self._deployment.stop(f"the service {self._deployment.stop_service} was called")
             response.success, response.message = True, "the arm stops"
         except GymMaraError as error:
             response.success, response.message = False, str(error)

@@ -108,6 +108,7 @@ class Driver:
     def _hold(self) -> None:
         """Forget the last command: the arm stays where the filter has started it."""
         self._command, self._commanded, self._setpoint = None, self._clock.now(), None
+        self._sent_until = -np.inf
 
     def command(self, q_target: Floats) -> None:
         """Move towards joint targets (J,), rad (m), from the next tick on.
@@ -195,9 +196,10 @@ class Driver:
         with self._lock:
             now = self._clock.now()
             state = self.link.state
-            if not self.live and state is not None and self._setpoint is not None:
+            last, begun = self._setpoint, self.safety.mode is not Mode.WAITING
+            if not self.live and begun and state is not None and last is not None:
                 # Nothing moves, so that the filter sees an arm that follows.
-                state = state._replace(q=self._setpoint.q, qd=self._setpoint.qd)
+                state = state._replace(q=last.q, qd=last.qd)
             setpoint = self.safety.step(now, state, self._command, self._commanded)
             self._setpoint = setpoint
             self._ticks += 1

@@ -1,17 +1,23 @@
-"""Who publishes and who subscribes to a topic, and whether they fit together."""
+"""Who publishes and who subscribes to a topic, whether they fit together, and which joints a controller has."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from gym_mara.ros2.node import needs_ros
 
 with needs_ros("ROS 2"):
+    from rcl_interfaces.srv import GetParameters
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 VOLATILE, TRANSIENT_LOCAL = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+
+_PATIENCE = 1.0
+"""How long the answer of a controller is waited for, s."""
+_POLL = 0.01
 
 
 class Endpoint(NamedTuple):
@@ -80,3 +86,31 @@ def qos_problem(publisher: Any, subscriber: Any) -> str | None:
     if publisher.durability == VOLATILE and subscriber.durability == TRANSIENT_LOCAL:
         return "the publisher is volatile, and the subscriber wants transient local"
     return None
+
+
+def joints_of(node: Any, controller: str) -> tuple[str, ...] | None:
+    """The joints of a controller in its order, of its parameter `joints`; None if it does not tell them.
+
+    Not for the thread of the node, which gets the answer.
+
+    Args:
+        node: the ROS node that asks.
+        controller: the full name of the controller's node.
+    """
+    service = f"{controller}/get_parameters"
+    if not node.count_services(service):
+        return None
+    client = node.create_client(GetParameters, service)
+    try:
+        if not client.wait_for_service(_PATIENCE):
+            return None
+        answer = client.call_async(GetParameters.Request(names=["joints"]))
+        end = time.monotonic() + _PATIENCE
+        while not answer.done():
+            if time.monotonic() > end:
+                return None
+            time.sleep(_POLL)
+        values = answer.result().values
+    finally:
+        node.destroy_client(client)
+    return tuple(values[0].string_array_value) or None if values else None

@@ -98,6 +98,8 @@ class RosLink:
         self.node = RosNode("gym_mara_link", domain=domain) if node is None else node
         self._publisher: Any = None
         self._client: Any = None
+        self.orders: dict[str, tuple[str, ...]] = {}
+        """The joints that the controllers of positions tell, by their nodes; after `command_problems`."""
         self._action = action
         self._commands = commands
         self._connect(commands)
@@ -277,7 +279,7 @@ class RosLink:
         found = graph.subscribers(node, topic)
         if not found:
             problems.append(
-                f"nobody listens to {topic}: the controller is not active, or has another name or namespace "
+                f"nobody listens to {topic}: the controller is not loaded, or has another name or namespace "
                 "(ros2 control list_controllers)"
             )
         elif all(endpoint.type != wanted for endpoint in found):
@@ -288,7 +290,22 @@ class RosLink:
             reason = graph.qos_problem(self._qos, endpoint.qos)
             if reason is not None:
                 problems.append(f"commands do not reach {endpoint.node}: {reason}")
+        if self.profile.commands == "positions":
+            problems += self._order_problems({endpoint.node for endpoint in found})
         return problems
+
+    def _order_problems(self, controllers: set[str]) -> list[str]:
+        """What is wrong with the order of the joints of controllers, of those that tell it."""
+        own = self.robot.joint_names
+        for each in controllers - self.orders.keys():
+            if (order := graph.joints_of(self.node.node, each)) is not None:
+                self.orders[each] = order
+        return [
+            f"{each} has the joints {', '.join(order)} in its parameter joints, and numbers for {', '.join(own)} would be sent: "
+            "give it the joints of the robot in this order, or choose another profile"
+            for each, order in self.orders.items()
+            if each in controllers and order != own
+        ]
 
     def close(self) -> None:
         """As in `Link`."""

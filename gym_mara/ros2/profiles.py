@@ -85,6 +85,10 @@ class Profile:
         commands = () if self.commands == "action" else (self.command_topic,)
         return (self.state_topic, *commands, f"{self._namespace}/{DESCRIPTION}")
 
+    def of_policy(self, name: str) -> str:
+        """The name of what a policy that is deployed on the arm offers: its topic "target", its services "stop" and "resume"."""
+        return f"{self._namespace}/gym_mara/{name}"
+
     @property
     def _namespace(self) -> str:
         return self.command_topic.rsplit("/", 2)[0]

@@ -201,6 +201,20 @@ def test_an_arm_that_rests_is_told_nothing_and_can_be_moved_by_hand(make: Make) 
     np.testing.assert_allclose(state.q, q, atol=1e-9)
 
 
+@pytest.mark.parametrize("live", [True, False])
+def test_an_arm_that_was_moved_before_the_first_command_starts_where_it_is(
+    make: Make, live: bool
+) -> None:
+    backend = make(live=live)
+    backend.clock.pass_by(1.0)
+    backend.arm.q = moved = backend.arm.q + 0.18
+    backend.driver.command(moved + 0.1)
+    backend.clock.pass_by(backend.driver.safety.period)
+    setpoint = backend.driver.setpoint
+    assert setpoint is not None
+    np.testing.assert_allclose(setpoint.q, moved, atol=1e-3)
+
+
 def test_a_reset_that_is_interrupted_stops_the_arm(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from gym_mara.deploy import OnnxPolicy
@@ -40,6 +41,7 @@ def arm(
     offset: float = 0.0,
     listens: bool = True,
     rival: bool = False,
+    gripper: bool = False,
 ) -> Iterator[None]:
     """An arm that publishes states with a clock of some speed, times real time, and an offset, s."""
     peer, ending = Peer("arm"), threading.Event()
@@ -56,6 +58,8 @@ def arm(
             now = began + offset + speed * (peer.ros.now() - began)
             message.header.stamp = messages.stamp(now)
             states.publish(message)
+            if gripper:
+                states.publish(JointState(header=message.header, name=["finger"], position=[0.0]))
 
     thread = threading.Thread(target=publish)
     thread.start()
@@ -67,8 +71,8 @@ def arm(
         peer.close()
 
 
-def checked(robot: RobotModel, about: Any = None) -> Report:
-    return check(robot, PROFILE, about, seconds=0.5)
+def checked(robot: RobotModel, about: Any = None, seconds: float = 0.5) -> Report:
+    return check(robot, PROFILE, about, seconds=seconds)
 
 
 def wrong(report: Report) -> dict[str, str]:
@@ -89,8 +93,31 @@ def test_nothing_is_wrong_with_a_good_arm(ros_domain: int, mara: RobotModel) -> 
     assert report.figures["latency"][0] >= about.control_period
 
 
+def test_the_states_of_a_gripper_on_the_same_topic_do_not_count(
+    ros_domain: int, mara: RobotModel
+) -> None:
+    with arm(gripper=True):
+        report = checked(mara)
+    assert set(wrong(report)) <= TIMES
+    assert report.figures["rate"] < 60.0
+    texts = {line.what: line.found for line in report.lines}
+    assert texts["joints"] == "all 6, by name, in the order of the robot"
+
+
+def test_a_controller_of_positions_that_does_not_tell_its_joints_is_noted(
+    ros_domain: int, mara: RobotModel, peer: Peer
+) -> None:
+    forward = make_profile("forward")
+    peer.heard(Float64MultiArray, forward.command_topic)
+    with arm():
+        report = check(mara, forward, seconds=0.5)
+    (note,) = (line.found for line in report.lines if line.what == "note")
+    assert "/peer does not tell its joints: compare them, and their order, with motor1" in note
+
+
 CASES: list[tuple[dict[str, Any], set[str], str]] = [
     ({"names": [f"ur_{name}" for name in NAMES]}, {"states", "joints"}, "prefix 'ur_'"),
+    ({"rate": 15.0, "speed": 0.92}, {"rate", "clock"}, "at least 20 are needed"),
     ({"speed": 0.5, "rival": True}, {"clock", "commands", "joints"}, "times real time"),
     ({"rate": 4.0}, {"rate", "jitter"}, "states a second"),
     ({"names": NAMES[:4]}, {"states", "joints"}, "motor5, motor6"),
@@ -106,13 +133,13 @@ CASES: list[tuple[dict[str, Any], set[str], str]] = [
 
 @pytest.mark.parametrize(
     ("options", "what", "words"),
-    [CASES[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[1:])],
+    [*CASES[:2], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[2:])],
 )
 def test_what_is_wrong_is_found(
     options: dict[str, Any], what: set[str], words: str, ros_domain: int, mara: RobotModel
 ) -> None:
     with arm(**options):
-        found = wrong(checked(mara))
+        found = wrong(checked(mara, seconds=2.0 if "rate" in what else 0.5))
     assert what <= set(found) <= what | TIMES
     assert words in " ".join(found.values())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -163,6 +164,24 @@ def test_after_a_collision_ahead_the_operator_resumes(
     assert _error(deployment, NEAR) < 1e-4
 
 
+def test_no_setting_resumes_an_arm_after_a_collision_ahead(
+    deploy: Callable[..., Deployment], policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for setting in ("reset", "terminate", "continue"):
+        with pytest.raises(GymMaraError, match="on_collision cannot be set"):
+            deploy(on_collision=setting)
+    trained = {**policy.about.training.env_options, "on_collision": "reset"}
+    monkeypatch.setattr(
+        policy,
+        "about",
+        dataclasses.replace(
+            policy.about,
+            training=dataclasses.replace(policy.about.training, env_options=trained),
+        ),
+    )
+    assert deploy().simulation.task.on_collision == "continue"
+
+
 def test_an_arm_that_falls_silent_is_told_while_it_rests(deploy: Callable[..., Deployment]) -> None:
     notes: list[str] = []
     deployment = deploy(notes.append)
@@ -210,7 +229,9 @@ def test_an_end_is_an_end(deploy: Callable[..., Deployment]) -> None:
 def test_an_end_is_one_on_the_way_back_to_the_start_too(
     deploy: Callable[..., Deployment], monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    deployment = deploy(on_collision="reset", max_joint_velocity=0.2)
+    deployment = deploy(max_joint_velocity=0.2)
+    simulation = deployment.simulation
+    simulation.task = dataclasses.replace(simulation.task, on_collision="reset")
     clock, start = _clock(deployment), _arm(deployment).q.copy()
     deployment.aim(NEAR).result()
     began, wait, collisions = clock.time, clock.sleep_until, [start]

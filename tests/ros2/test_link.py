@@ -13,6 +13,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -234,6 +236,26 @@ def test_topics_of_other_types_are_found(
         "std_msgs/msg/Float64MultiArray, and trajectory_msgs/msg/JointTrajectory would be sent",
     )
     eventually(lambda: all(text in "; ".join(link.problems()) for text in wanted))
+
+
+def test_a_controller_with_another_order_of_joints_is_found(
+    links: Callable[..., RosLink], peer: Peer, mara: RobotModel
+) -> None:
+    order = NAMES[::-1]
+
+    def tell(request: Any, response: Any) -> Any:
+        assert request.names == ["joints"]
+        response.values = [ParameterValue(type=9, string_array_value=order)]
+        return response
+
+    peer.ros.node.create_service(GetParameters, "/peer/get_parameters", tell)
+    peer.heard(Float64MultiArray, "/forward_position_controller/commands")
+    link = links(mara, "forward")
+    eventually(lambda: "/peer has the joints motor6, motor5" in "; ".join(link.command_problems()))
+    order.reverse()
+    link.close()
+    other = links(mara, "forward")
+    eventually(lambda: not other.command_problems() and other.orders)
 
 
 def test_a_quality_of_service_that_does_not_fit_is_found(

@@ -61,7 +61,7 @@ def record(
     from gym_mara.ros2.bags.recording import lacking_joints, topics_of
     from gym_mara.ros2.bags.recording import record as run
 
-    wanted, model = tuple(topic), None
+    wanted, model = tuple(f"/{name.lstrip('/')}" for name in topic), None
     if profile is None:
         refuse(context, "it has no effect without --profile", "robot", "controller", "namespace")
     else:
@@ -69,13 +69,17 @@ def record(
         model = RobotModel.load(robot)
         chosen.check(model.joint_names)
         topics, notes = topics_of(chosen)
-        wanted = tuple(dict.fromkeys((*topics, *topic)))
+        wanted = tuple(dict.fromkeys((*topics, *wanted)))
         for note in notes:
             err.print(f"note: {note}.", soft_wrap=True)
     if bag.exists():
         raise GymMaraError(f"{str(bag)!r} exists and is not overwritten: delete it first")
     err.print("Recording; stop with Ctrl-C.")
-    counts = run(bag, wanted, seconds, domain=domain)
+
+    def absent(topics: list[str]) -> None:
+        err.print(f"note: not there yet: {', '.join(topics)}.", soft_wrap=True)
+
+    counts = run(bag, wanted, seconds, domain=domain, absent=absent)
     missing = [name for name in wanted if name not in counts]
     _print(f"Recorded in {bag}", counts)
     if missing:

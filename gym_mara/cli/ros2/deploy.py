@@ -57,7 +57,7 @@ def deploy(
         str | None,
         typer.Option(
             metavar=_TARGET,
-            help="The first target, m, in the world; others come on the topic /gym_mara/target.",
+            help="The first target, m, in the world; others come on the topic /gym_mara/target, after the namespace.",
         ),
     ] = None,
     profile: ProfileOption = "trajectory",
@@ -93,8 +93,8 @@ def deploy(
         "live": live,
     }
     with _exported(policy, env) as exported:
-        from gym_mara.ros2.deploy import RESUME, Deployment
-        from gym_mara.ros2.deploy_node import STOP, TARGET, DeployNode
+        from gym_mara.ros2.deploy import Deployment
+        from gym_mara.ros2.deploy_node import DeployNode
         from gym_mara.ros2.safety.filter import NO_EMERGENCY_STOP
 
         out.print(f"note: {NO_EMERGENCY_STOP}.", soft_wrap=True)
@@ -109,10 +109,10 @@ def deploy(
                 out.print(f"note: {note}.", soft_wrap=True)
             if first is not None:
                 deployment.check(first)
-            DeployNode(deployment, deployment.node, _note)
+            offered = DeployNode(deployment, deployment.node, _note).offered
             if first is not None:
                 deployment.aim(first)
-            out.print(f"ready: targets on {TARGET}, services {STOP} and {RESUME}", soft_wrap=True)
+            out.print(f"ready: {offered}", soft_wrap=True)
             out.file.flush()
             with _table(deployment):
                 deployment.run(seconds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from itertools import islice
@@ -18,7 +18,7 @@ from gym_mara.robot import RobotModel
 from gym_mara.ros2 import messages
 from gym_mara.ros2.bags.bag import Bag, Recorder
 from gym_mara.ros2.bags.logs import STATE_TYPE
-from gym_mara.ros2.deploy_node import DIAGNOSTICS, TARGET
+from gym_mara.ros2.deploy_node import DIAGNOSTICS
 from gym_mara.ros2.link import DISCOVERY, installed
 from gym_mara.ros2.node import RosNode, needs_ros
 from gym_mara.ros2.profiles import DESCRIPTION, Profile
@@ -41,6 +41,8 @@ _POLL = 0.1
 """How often new topics are looked for, s."""
 PATIENCE = 10.0
 """How long the first message is waited for, s."""
+ABSENT = 3.0
+"""After which time the named topics that are not there yet are noted, s."""
 _DEPTH = 1000
 _LOOKED_AT = 1000
 """In how many states `lacking_joints` looks for joints."""
@@ -68,7 +70,7 @@ def topics_of(profile: Profile) -> tuple[tuple[str, ...], tuple[str, ...]]:
     own, notes = installed(profile)
     if own.commands == "action":
         notes += (f"the goals of the action {own.command_topic} are on no topic: not recorded",)
-    return (*own.topics, TARGET, DIAGNOSTICS), notes
+    return (*own.topics, own.of_policy("target"), DIAGNOSTICS), notes
 
 
 def record(
@@ -77,6 +79,7 @@ def record(
     duration: float | None = None,
     *,
     domain: int | None = None,
+    absent: Callable[[list[str]], None] = lambda _: None,
 ) -> dict[str, int]:
     """Record topics until the duration is over or the process is interrupted; returns how many messages each has. A topic that
     was named and has not appeared is not in there.
@@ -87,6 +90,7 @@ def record(
         duration: from the first message on, but for a robot's description, s, which is waited for at most PATIENCE longer; None
             for no end.
         domain: the ROS domain; by default that of ROS_DOMAIN_ID, or 0.
+        absent: is called once, after ABSENT, with the named topics that have not appeared yet, if there are some.
 
     Raises:
         GymMaraError: the folder exists, or cannot be written.
@@ -98,7 +102,7 @@ def record(
         with Recorder(folder) as recorder:
             subscribed: set[str] = set()
             recording: float | None = None
-            end, look = math.inf, 0.0
+            end, look, note = math.inf, 0.0, time.monotonic() + ABSENT
             if duration is not None:
                 end = time.monotonic() + duration + PATIENCE
             try:
@@ -106,6 +110,10 @@ def record(
                     if now >= look:
                         _subscribe(node, recorder, topics, subscribed, arrived)
                         look = now + _POLL
+                    if now >= note:
+                        note = math.inf
+                        if missing := [name for name in topics if name not in subscribed]:
+                            absent(missing)
                     _drain(recorder, arrived, min(_POLL, end - now))
                     if duration is not None and recording is None and _moves(recorder):
                         recording = time.monotonic()

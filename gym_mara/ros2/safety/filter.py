@@ -40,7 +40,7 @@ class Mode(str, Enum):
     """What the filter does."""
 
     WAITING = "waiting"
-    """It has not started, or it holds the arm at rest until the first command."""
+    """It has not started, or it sends nothing until the first command: the arm may be moved by others."""
     MOVING = "moving"
     """It follows the commands, and holds the arm where they are reached."""
     STOPPING = "stopping"
@@ -56,7 +56,8 @@ class SafetyFilter:
     it nor the way to the set-point collides. A set-point without one is refused: the arm follows the last stop, and the stop is
     latched. What stops the arm as well: a command that is no J finite numbers, or too old while the arm moves; a state that is too old;
     an arm that does not follow its set-points; a pause between ticks while it moves; a clock that does not advance. A target beyond the
-    joint limits is cut to them. Commands take effect only after `start`; after a stop only after `resume`.
+    joint limits is cut to them. Commands take effect only after `start`; after a stop only after `resume`. The first one moves the arm
+    from where it is measured then, and only if it could start there.
 
     It replaces no emergency stop. Its methods may be called from any thread.
 
@@ -216,7 +217,7 @@ class SafetyFilter:
             try:
                 trouble = wrong_clock(before, now)
                 if self.mode is Mode.MOVING or not (command is None or commanded < self._begun):
-                    trouble = trouble or self._guard.wrong_state(now, state, self._motion.q)
+                    trouble = trouble or self._wrong_state(now, state)
                     trouble = trouble or self._pause(before, now)
                     trouble = trouble or self._follow(now, command, commanded)
             except Exception as error:  # whatever fails, in an engine too, the arm has to stop
@@ -225,6 +226,16 @@ class SafetyFilter:
                 self.stop(trouble)
         if self.mode is Mode.STOPPING and self._motion.follow_stop():
             self.mode = Mode.STOPPED
+
+    def _wrong_state(self, now: float, state: Any) -> str | None:
+        """What is wrong with the arm's state. Before the first command it may have been moved: the set-point goes to where it is."""
+        trouble = self._guard.wrong_state(now, state, self._motion.q)
+        if trouble is None and self.mode is Mode.WAITING:
+            try:
+                self._rest_at(state, now)
+            except GymMaraError as error:
+                return str(error)
+        return trouble
 
     def _pause(self, before: float, now: float) -> str | None:
         """What is wrong with the time since the last tick: without set-points the arm's controller has stopped it."""
@@ -263,36 +274,33 @@ class SafetyFilter:
         return None
 
     def _begin(self, state: Any, now: float) -> None:
-        robot = self.robot
         if state is None:
             raise GymMaraError("the arm reports no state, and moves only from a measured pose")
-        trouble = too_old("the arm's state", now, state.received, self.watchdogs.state_age)
-        if trouble:
-            raise GymMaraError(f"{trouble}: check that it is published")
-        velocity = self._guard.numbers(state.qd)
-        if isinstance(velocity, str):
-            raise GymMaraError(f"the arm's velocity {velocity}")
-        fastest = int(np.abs(velocity).argmax())
-        if abs(velocity[fastest]) > (allowed := self.watchdogs.rest_velocity):
-            raise GymMaraError(
-                f"the arm moves: {robot.joint_names[fastest]} at {velocity[fastest]:.3g} rad/s (m/s); it can start only at rest, "
-                f"below {allowed:g}; if it rests and its encoders are noisy, give a larger rest_velocity"
-            )
+        self._rest_at(state, now)
+        self.mode, self.reason, self.blocked = Mode.WAITING, None, False
+        self._started = True
+        self._moved, self._now, self._begun = 0.0, now, now
+
+    def _rest_at(self, state: Any, now: float) -> None:
+        """Put the set-point at rest at the measured pose.
+
+        Raises:
+            GymMaraError: the arm cannot start there, and nothing has changed.
+        """
+        self._guard.check_rest(now, state)
         measured = self._guard.numbers(state.q)
         if not isinstance(measured, str):
             within = self._motion.clip(measured)
             if all(abs(a - b) <= OVERSHOOT for a, b in zip(within, measured, strict=True)):
                 measured = within
-        q = robot.checked_q(state.q if isinstance(measured, str) else measured, "the measured pose")
+        q = state.q if isinstance(measured, str) else measured
+        q = self.robot.checked_q(q, "the measured pose")
         if self._paths is not None and self._paths.collides(q):
             raise GymMaraError(
                 f"the arm collides at its measured pose{self._touching(q)}: move it by hand or with its own controller, or "
                 "correct the robot's model"
             )
         self._motion.rest_at(q.tolist())
-        self.mode, self.reason, self.blocked = Mode.WAITING, None, False
-        self._started = True
-        self._moved, self._now, self._begun = 0.0, now, now
 
     def _touching(self, q: Floats) -> str:
         """The links that touch at q (J,), for a reason; Coal may see no contact where another engine does."""

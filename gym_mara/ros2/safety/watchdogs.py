@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.errors import positive_number
+from gym_mara.errors import GymMaraError, positive_number
 from gym_mara.ros2.arm import ArmState
 
 _UNITS = {"state_age": "s", "command_age": "s", "tracking_error": "rad", "rest_velocity": "rad/s"}
@@ -70,6 +70,25 @@ class Guard:
                     f"{largest:g} are allowed"
                 )
         return None
+
+    def check_rest(self, now: float, state: ArmState) -> None:
+        """Check that a state is fresh, and the arm at rest.
+
+        Raises:
+            GymMaraError: it is not.
+        """
+        trouble = too_old("the arm's state", now, state.received, self._watchdogs.state_age)
+        if trouble:
+            raise GymMaraError(f"{trouble}: check that it is published")
+        velocity = self.numbers(state.qd)
+        if isinstance(velocity, str):
+            raise GymMaraError(f"the arm's velocity {velocity}")
+        fastest = int(np.abs(velocity).argmax())
+        if abs(velocity[fastest]) > (allowed := self._watchdogs.rest_velocity):
+            raise GymMaraError(
+                f"the arm moves: {self._joints[fastest]} at {velocity[fastest]:.3g} rad/s (m/s); it can start only at rest, "
+                f"below {allowed:g}; if it rests and its encoders are noisy, give a larger rest_velocity"
+            )
 
     def numbers(self, values: Any) -> list[float] | str:
         """J finite numbers, or what is wrong with the values."""

@@ -29,7 +29,7 @@ class FollowAction:
         self, node: Any, name: str, arm: SimulatedArm, delay_of: Callable[[Any], float]
     ) -> None:
         self._arm, self._delay_of = arm, delay_of
-        self._log = node.get_logger()
+        self._node, self._log = node, node.get_logger()
         self._type = messages.follow_joint_trajectory_type()
         self._running: dict[int, tuple[Any, Any]] = {}
         self._server = ActionServer(
@@ -44,9 +44,11 @@ class FollowAction:
     def update(self) -> None:
         """Stop the arm for goals that are cancelled, and wake those whose commands have ended; called after each tick."""
         for number, (goal, future) in list(self._running.items()):
-            if self._arm.outcome(number) != RUNNING:
+            if (outcome := self._arm.outcome(number)) != RUNNING:
                 del self._running[number]
-                future.set_result(None)
+                future.set_result(outcome)
+                if (executor := self._node.executor) is not None:
+                    executor.wake()  # it does not see by itself what another thread has set
             elif goal.is_cancel_requested:
                 self._arm.follow((), ())
 
@@ -64,8 +66,7 @@ class FollowAction:
             return result
         future = Future()
         self._running[number] = goal, future
-        await future
-        if self._arm.outcome(number) == DONE:
+        if await future == DONE:
             goal.succeed()
         elif goal.is_cancel_requested:
             goal.canceled()

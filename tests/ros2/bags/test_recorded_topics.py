@@ -44,7 +44,7 @@ def test_a_profile_records_the_topics_of_its_arm_alone(
     arguments = ["--profile", "forward", "--namespace", "left", "--seconds", "0.5"]
     code, output, error = gym_mara("ros2", "record", bag, *arguments)
     assert (code, error.count("note")) == (0, 0)
-    missing = "/left/forward_position_controller/commands, /gym_mara/target, /diagnostics"
+    missing = "/left/forward_position_controller/commands, /left/gym_mara/target, /diagnostics"
     assert f"not found: {missing}\n" in output
     assert "lack" not in output
     with Bag(bag) as read:
@@ -67,6 +67,20 @@ def test_states_of_another_robot_are_told_and_other_topics_are_recorded_too(
     assert "/diagnostics, /right/joint_states\n" in output
     (row,) = (line for line in output.splitlines() if "/more" in line)
     assert row.split()[-2] == "0"
+
+
+def test_a_topic_needs_no_slash_and_those_that_are_not_there_are_noted(
+    peer: Peer, tmp_path: Path, gym_mara: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "ABSENT", 0.5)
+    arm(peer, "/left")
+    arguments = ["--topic", "left/joint_states", "--topic", "missing", "--seconds", "1"]
+    code, output, error = gym_mara("ros2", "record", tmp_path / "bag", *arguments)
+    assert code == 0
+    assert error.count("note: not there yet: /missing.") == 1
+    assert "not found: /missing\n" in output
+    with Bag(tmp_path / "bag") as read:
+        assert len(list(read.messages(["/left/joint_states"]))) > 10
 
 
 @pytest.mark.parametrize(
@@ -100,7 +114,8 @@ def test_states_of_control_msgs_are_recorded_where_they_are_installed(
 
 def test_the_goals_of_an_action_are_not_recorded() -> None:
     topics, notes = recording.topics_of(make_profile("action", namespace="left"))
-    assert topics == ("/left/joint_states", "/left/robot_description", *OF_A_POLICY)
+    policy = ("/left/gym_mara/target", "/diagnostics")
+    assert topics == ("/left/joint_states", "/left/robot_description", *policy)
     assert "follow_joint_trajectory are on no topic" in notes[0]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,44 @@ def test_an_arm_with_noisy_encoders_starts_and_resumes_with_a_larger_rest_veloci
     with pytest.raises(GymMaraError, match=r"0\.098 rad/s.*below 0\.05"):
         safety.resume(state_of(mara.home, 1.01, 2.0 * noisy), 1.01)
     safety.resume(state_of(mara.home, 1.01, noisy), 1.01)
+
+
+def test_an_arm_that_was_moved_while_it_waited_starts_where_it_is(mara: RobotModel) -> None:
+    arm = Arm(mara, make_checker("coal", mara))
+    arm.ticks(None, 50)
+    arm.q = measured = mara.home + 0.18
+    path = np.array([measured, *(setpoint.q for setpoint in arm.ticks(mara.home, 200))])
+    arm.is_in(Mode.MOVING)
+    assert np.abs(path[1] - measured).max() < 1e-3
+    assert (np.abs(np.diff(path, axis=0)) <= mara.velocity_limit * PERIOD + 1e-9).all()
+    np.testing.assert_array_equal(path[-1], mara.home)
+
+
+def test_an_arm_that_was_moved_far_while_it_waited_needs_an_operator(mara: RobotModel) -> None:
+    arm = Arm(mara)
+    arm.tick(None)
+    arm.q = mara.home + 0.5
+    arm.tick(mara.home, state=state_of(arm.q, arm.now + PERIOD))
+    assert "the arm does not follow" in (arm.filter.reason or "")
+    arm.filter.resume(state_of(mara.home + 0.5, arm.now), arm.now)
+    setpoint = arm.tick(mara.home, state=state_of(mara.home + 0.5, arm.now))
+    np.testing.assert_allclose(setpoint.q, mara.home + 0.5, atol=1e-3)
+
+
+def test_an_arm_that_cannot_start_at_the_first_command_stays_where_it_is(mara: RobotModel) -> None:
+    moving, colliding = np.array([0, 0, 0.3, 0, 0, 0]), np.array(COLLIDING_Q)
+    for q, qd, reason in (
+        (mara.home + 0.1, moving, r"the arm moves: motor3 at 0\.3 rad/s.*only at rest"),
+        (mara.home, np.full(6, np.nan), "the arm's velocity is not finite"),
+        (colliding, 0.0, r"the arm collides at its measured pose: \w+.* and \w+"),
+        (mara.upper + 0.1, 0.0, "the measured pose: joint motor1 cannot be at"),
+    ):
+        arm = Arm(mara, make_checker("coal", mara), Watchdogs(tracking_error=10.0))
+        arm.ticks(None, 50)
+        arm.tick(mara.home + 0.2, state=state_of(q, arm.now + PERIOD, qd))
+        arm.is_in(Mode.STOPPED)
+        assert re.match(reason, arm.filter.reason or "")
+        np.testing.assert_array_equal(arm.q, mara.home, "no set-point leads anywhere")
 
 
 @pytest.mark.parametrize("field", ["state_age", "command_age", "tracking_error", "rest_velocity"])

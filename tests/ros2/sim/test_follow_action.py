@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,7 @@ from gym_mara.ros2 import messages
 from gym_mara.ros2.sim import follow_action
 from gym_mara.ros2.sim.arm import SimulatedArm
 from gym_mara.ros2.sim.follow_action import FollowAction
+from tests.ros2.peers import Peer, eventually
 
 
 class Result:
@@ -56,7 +58,7 @@ def action(arm: SimulatedArm, monkeypatch: pytest.MonkeyPatch) -> FollowAction:
     kind = SimpleNamespace(Result=Result)
     monkeypatch.setattr(messages, "follow_joint_trajectory_type", lambda: kind)
     monkeypatch.setattr(follow_action, "ActionServer", lambda *_, **__: None)
-    node = SimpleNamespace(get_logger=Logger)
+    node = SimpleNamespace(get_logger=Logger, executor=None)
     return FollowAction(node, "follow", arm, lambda header: 0.0)
 
 
@@ -104,6 +106,35 @@ def test_another_command_aborts_a_goal(
     with pytest.raises(StopIteration):
         steps.send(None)
     assert goal.ended == "aborted"
+
+
+def test_a_goal_that_is_over_succeeds_though_another_command_comes_before_its_result(
+    action: FollowAction, arm: SimulatedArm, mara: RobotModel
+) -> None:
+    goal = goal_of(mara)
+    steps = run(action, arm, goal, 5)
+    while action._running:
+        arm.tick()
+        action.update()
+    arm.move_to(mara.home.tolist())
+    with pytest.raises(StopIteration):
+        steps.send(None)
+    assert goal.ended == "succeeded"
+
+
+def test_the_result_comes_at_once(
+    action: FollowAction, arm: SimulatedArm, mara: RobotModel, peer: Peer
+) -> None:
+    action._node = peer.ros.node
+    for _ in range(3):  # the executor looks by itself once a second
+        goal = goal_of(mara)
+        peer.ros.node.executor.create_task(action._execute(goal))
+        eventually(lambda: action._running)
+        time.sleep(0.1)  # it waits again
+        while action._running:
+            arm.tick()
+            action.update()
+        eventually(lambda goal=goal: goal.ended == "succeeded", 0.6)  # type: ignore[misc]
 
 
 def test_a_goal_that_is_cancelled_stops_the_arm(
