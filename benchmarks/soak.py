@@ -12,6 +12,7 @@ warms up. It prints a Markdown page, and exits with 1 if something was wrong.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 import time
@@ -46,6 +47,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0)
     arguments = parser.parse_args()
     few_arenas()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the simulated arm ends, too
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ros.simulated_arm():
         todo = {

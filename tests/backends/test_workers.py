@@ -217,7 +217,7 @@ def test_any_error_in_a_worker_comes_with_its_traceback(
 
 
 def test_a_result_that_does_not_pickle_is_an_error() -> None:
-    with closing(_troubled()) as backend, pytest.raises(Exception, match="pickle|local object"):
+    with closing(_troubled()) as backend, pytest.raises(Exception, match=r"pickle|local object"):
         backend.save()
 
 
