@@ -27,6 +27,22 @@ _NO_RENDERER = -1
 """A key that no renderer has."""
 _M_ARENA_MAX = -8
 """The number of glibc's parameter in malloc.h."""
+_libc = ctypes.CDLL(None)
+
+
+class _MallInfo(ctypes.Structure):
+    """glibc's struct mallinfo2."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
+            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
+        )
+    )
+
+
+_libc.mallinfo2.restype = _MallInfo
 
 
 @dataclass
@@ -52,13 +68,9 @@ class Tally:
         self.wrong["other result"] += int(pickle.dumps(first) != pickle.dumps(again))
 
 
-def few_arenas() -> None:
-    """Limit the allocator of glibc to two arenas, before there are threads.
-
-    Each new thread would take one of sixteen on two cores, and what is free between the blocks of an arena stays resident: it grows for
-    hours without a leak.
-    """
-    ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
+def one_arena() -> None:
+    """Let the allocator of glibc keep everything in one heap, before there are threads, so that its memory can be told from others."""
+    _libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def _arrays(observation: Any) -> Iterator[Any]:
@@ -79,25 +91,31 @@ class Usage:
     """What this process and its children use."""
 
     memory: int
-    """Resident memory of this process, bytes."""
+    """Memory of this process: what is resident, but of the allocator's heap only what is allocated, bytes. What is free between blocks
+    stays resident, and grows for hours without a leak."""
     memory_of_children: int
-    """That of its children, bytes: of the simulated arm."""
+    """Resident memory of its children, bytes: of the simulated arm."""
+    resident_memory: int
+    """Resident memory of this process, bytes."""
     threads: int
     files: int
     processes: int
 
     @classmethod
     def now(cls) -> Usage:
-        """After a garbage collection, without the memory that is free and that the allocator of glibc keeps."""
+        """After a garbage collection."""
         gc.collect()
         free(_NO_RENDERER, wait=True)  # the drawing thread has freed what was collected
-        ctypes.CDLL(None).malloc_trim(0)
+        _libc.malloc_trim(0)
         process = psutil.Process()
+        resident = process.memory_info().rss
+        heap = sum(each.rss for each in process.memory_maps() if each.path == "[heap]")
         children = process.children(recursive=True)
         family = [process, *children]
         return cls(
-            process.memory_info().rss,
+            resident - heap + _libc.mallinfo2().uordblks,
             sum(one.memory_info().rss for one in children),
+            resident,
             sum(one.num_threads() for one in family),
             sum(one.num_fds() for one in family),
             len(family),
