@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import signal
 import sys
 import tempfile
@@ -23,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from soaking import environments, ros, written
-from soaking.tally import DONE, WRONG, Tally, Usage, one_arena
+from soaking.tally import DONE, WRONG, Tally, Usage
 
 GROWTH = {"memory": 0.01, "memory_of_children": 0.01, "resident_memory": math.inf}
 """The largest growth that passes; that of what is not named is 0."""
@@ -47,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     arguments = parser.parse_args()
-    one_arena()
+    _keep_one_arena()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the simulated arm ends, too
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ros.simulated_arm():
@@ -65,6 +66,15 @@ def main() -> None:
             print(f"round {number + 1}: {usage[-1]}", file=sys.stderr, flush=True)
     failed = _print_page(tallies, usage, time.monotonic() - started)
     raise SystemExit(failed)
+
+
+def _keep_one_arena() -> None:
+    """Start the program again with one heap of glibc for all threads, so that what is allocated there can be told from other memory."""
+    if os.environ.get("MALLOC_ARENA_MAX") != "1":
+        sys.stdout.flush()
+        os.execve(
+            sys.executable, [sys.executable, *sys.argv], {**os.environ, "MALLOC_ARENA_MAX": "1"}
+        )
 
 
 def _print_page(tallies: dict[str, Tally], usage: list[Usage], seconds: float) -> bool:

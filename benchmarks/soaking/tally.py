@@ -25,8 +25,6 @@ WRONG = ("NaN", "outside the space", "other result", "black picture", "left file
 
 _NO_RENDERER = -1
 """A key that no renderer has."""
-_M_ARENA_MAX = -8
-"""The number of glibc's parameter in malloc.h."""
 _libc = ctypes.CDLL(None)
 
 
@@ -66,11 +64,6 @@ class Tally:
         """Count a comparison of two results that must be equal."""
         self.done["comparisons"] += 1
         self.wrong["other result"] += int(pickle.dumps(first) != pickle.dumps(again))
-
-
-def one_arena() -> None:
-    """Let the allocator of glibc keep everything in one heap, before there are threads, so that its memory can be told from others."""
-    _libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def _arrays(observation: Any) -> Iterator[Any]:
