@@ -153,7 +153,9 @@ def _refuse_what_has_no_effect(context: typer.Context, run: Path | None, file: P
     """Refuse the options of `watch` that mean nothing with this run or this exported policy, or without any."""
     if run is None and file is None:
         names = "policy", "video", "targets"
-        refuse(context, "without a run folder there is no policy to play", *names)
+        refuse(
+            context, "without a run folder or an exported policy there is no policy to play", *names
+        )
     elif run is not None:
         refuse(context, "a run has its own environment", "env")
     if not is_given(context, "video"):

@@ -76,9 +76,7 @@ def read_geometry(
     text = ElementTree.tostring(root, encoding="unicode")
     of_kind = pin.GeometryType.COLLISION if kind == "collision" else pin.GeometryType.VISUAL
     with parsing(urdf):
-        geometry_model = (
-            pin.GeometryModel()
-        )  # without it Pinocchio 4.1 would keep an object of Python for ever
+        geometry_model = pin.GeometryModel()  # else Pinocchio 4.1 leaves an object of Python behind
         pin.buildGeomFromUrdfString(model, text, of_kind, geometry_model)
     shapes: list[Shape] = []
     for geometry_object in geometry_model.geometryObjects:

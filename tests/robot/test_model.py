@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,6 +41,18 @@ def test_a_path_may_be_a_string(tmp_path: Path) -> None:
 
 def test_a_model_loads_as_itself(mara: RobotModel) -> None:
     assert RobotModel.load(mara) is mara
+
+
+def test_a_robot_that_is_dropped_leaves_nothing_of_pinocchio() -> None:
+    def geometries() -> int:
+        gc.collect()
+        return sum(type(each).__name__ == "GeometryModel" for each in gc.get_objects())
+
+    RobotModel.load("mara")
+    before = geometries()
+    for _ in range(3):
+        RobotModel.load("mara")
+    assert geometries() == before
 
 
 def test_home_is_the_nearest_to_zero_within_the_limits(tmp_path: Path) -> None:
