@@ -53,3 +53,10 @@ def test_every_library_has_a_lowest_version_that_is_not_above_the_installed_one(
     assert not [name for name, (lowest, _) in table.items() if lowest == "-"]
     found = {name: each for name, each in table.items() if each[1] != "-"}
     assert [name for name, (low, now) in found.items() if Version(now) < Version(low)] == []
+
+
+def test_the_page_of_versions_has_every_library_of_pyproject() -> None:
+    rows = runpy.run_path(str(ROOT / "benchmarks" / "versions.py"))["rows"]
+    page = (ROOT / "docs" / "versions.md").read_text(encoding="utf-8").partition("## The table")[2]
+    listed = re.findall(r"^\| ([\w-]+) \| ([\w, -]+) \| ([\w.]+) \| \S+ \|$", page, re.M)[1:]
+    assert listed == [tuple(row[:3]) for row in rows()]

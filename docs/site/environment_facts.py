@@ -25,6 +25,8 @@ from gym_mara.tasks.arm_parts import ArmParts
 DOCS = Path(__file__).resolve().parents[1]
 PICTURES = DOCS / "_build" / "pictures"
 _COMMENT = re.compile(r"^<!-- (facts|results|overview) ?(\S*) -->$", re.M)
+_TARGET = ("target_position", "target_quaternion")
+"""Fields that a task refuses if it draws its targets."""
 _RESULTS = {
     "position error, mm": ".4f",
     "angle, deg": ".2f",
@@ -118,16 +120,26 @@ def _observation(env: Any) -> str:
     else:
         form = f"An array {space.shape}"
     rows = [
-        [f"`{part.name}`", len(part.low), _range(part.low, part.high), part.unit, _meaning(part)]
+        [f"`{part.name}`", len(part.low), _range(part.low, part.high), _unit(part), _meaning(part)]
         for part in simulation.observation.parts
     ]
     head = ["part", "size", "range", "unit", "meaning"]
     return f"## Observation\n\n{form} of {space.dtype or 'float64'}, of these parts in this order:\n\n{_table(head, rows)}"
 
 
+def _unit(part: Part) -> str:
+    """The unit of a part of MARA's observation: its joints turn."""
+    return part.unit.replace("joint", "rad")
+
+
 def _meaning(part: Part) -> str:
     """The first sentence of the docstring of what makes a part."""
-    maker = getattr(observation, part.name, None) or getattr(ArmParts, part.name)
+    makers = (
+        getattr(observation, part.name, None),
+        getattr(ArmParts, f"{part.name}_at_scales", None),
+        getattr(ArmParts, part.name, None),
+    )
+    maker = next(filter(None, makers))
     return _plain(inspect.getdoc(maker) or "").partition("\n\n")[0].replace("\n", " ")
 
 
@@ -168,7 +180,8 @@ def _keywords(made: Environment, task: Task) -> str:
                 for (owner, name), text in found.items()
                 if owner == cls.__name__
             }
-    fields = [field.name for field in dataclasses.fields(task)]
+    refused = _TARGET if task.random_goal else ()
+    fields = [field.name for field in dataclasses.fields(task) if field.name not in refused]
     rows = [[f"`{name}`", f"`{_plain_value(getattr(task, name))}`", docs[name]] for name in fields]
     if made.goals:
         rows = _goal_keywords() + rows

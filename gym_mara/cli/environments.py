@@ -40,7 +40,8 @@ def list_() -> None:
             continue
         uses = ["distance"]
         uses += ["orientation"] if getattr(task, "orientation", False) else []
-        uses += ["collision"] if getattr(task, "collision_penalty", False) else []
+        costs = "collision_penalty", "collision_weight"
+        uses += ["collision"] if any(getattr(task, name, False) for name in costs) else []
         table.add_row(environment_id(name), ", ".join(uses), task.on_collision)
     out.print(table)
     table = Table("algorithm", "what it is", "presets", title="Algorithms")

@@ -52,12 +52,14 @@ class AnyTargetTask(Task):
     preset_family: ClassVar[str] = "any_target"
 
     on_collision: str = "terminate"
+    start_q: tuple[float, ...] | None = None
+    """The start configuration (J,), rad (m for a prismatic joint); None for that of `start`."""
     orientation: bool = False
     """Whether the target has an orientation."""
     start: str = "random"
     """Where episodes begin: at a "random" collision-free configuration, or at "home"; `start_q` has precedence."""
     guide: bool = False
-    """Whether the way to the nearest configuration for the target is observed, which inverse kinematics finds."""
+    """Whether the way to the nearest configuration for the target is observed and rewarded; inverse kinematics finds it."""
     position_tolerance: float = 0.002
     """The largest distance to the target that is a success, m."""
     angle_tolerance: float = float(np.radians(2.5))

@@ -113,13 +113,13 @@ class ArmParts:
         return _at_scales(xp, turn, size, scales)
 
     def joint_ways_at_scales(self, state: SimState, goal: Goal) -> Floats:
-        """`joint_ways` x as x / (|x| + k) for each scale k (N, S J)."""
+        """How far each joint alone must move to bring the tool nearest to the target, x, as x / (|x| + k) for each scale k (N, S J)."""
         ways = self.joint_ways(state, goal)
         xp, _, _, scales, _ = self._scales.like(ways)
         return _at_scales(xp, ways, xp.abs(ways), scales)
 
     def joint_turns_at_scales(self, state: SimState, goal: Goal) -> Floats:
-        """`joint_turns` x as x / (|x| + k) for each scale k (N, S J)."""
+        """How far each joint alone must turn to align the tool best with the target, x, as x / (|x| + k) for each scale k (N, S J)."""
         turns = self.joint_turns(state, goal)
         xp, _, _, scales, _ = self._scales.like(turns)
         return _at_scales(xp, turns, xp.abs(turns), scales)

@@ -33,7 +33,7 @@ class RandomReachTask(ReachTask):
         super().__post_init__()
         if self.target_position is not None or self.target_quaternion is not None:
             raise GymMaraError(
-                "this task draws its targets: leave out target_position and target_quaternion, or choose MARA-v0"
+                "this task draws its targets: give target_position and target_quaternion to reset, in its options, or choose MARA-v0"
             )
 
     def draw_goal(

@@ -26,9 +26,9 @@ class ActionSettings:
     """The action mode: "absolute" for joint targets, "relative" for a step of each joint, or "cartesian" for a twist of the
     tool; None for the task's own."""
     action_scale: float | Sequence[float] | None = None
-    """What the action 1 means. Relative: a step, rad (m for a prismatic joint); None for the way that the joint can travel in
-    a control period. Cartesian: a velocity, m/s and rad/s; None for 0.4 m/s and 0.8 rad/s. One number, or one for each entry
-    of the action."""
+    """What the action 1 means. Relative: a step, rad (m for a prismatic joint); None for the smallest one
+    with which the joint moves at its velocity limit. Cartesian: a velocity, m/s and rad/s; None for 0.4 m/s and 0.8 rad/s. One
+    number, or one for each entry of the action."""
     action_from: str = "position"
     """Where a step begins: at the "position" of the joints, as the sensors see it, or at their last "target"."""
 
