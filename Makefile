@@ -38,7 +38,7 @@ bench: ## Measure speed. The other packages that it compares with pin an older M
 	.venv-bench/bin/python benchmarks/dynamics.py
 	.venv-bench/bin/python benchmarks/rendering.py
 
-experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; most of an hour.
+experiment: $(READY) ## Repeat the paper's experiment: three algorithms, four environments, three seeds; a quarter of an hour on two cores.
 	$(BIN)/gym-mara benchmark --out runs/experiment
 
 test-oldest: .venv-oldest/.ready ## Run the tests of environments, pictures and Stable-Baselines3 with the oldest supported Gymnasium.

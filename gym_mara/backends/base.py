@@ -84,11 +84,11 @@ class Backend(ABC):
 
     @abstractmethod
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
-        """Put all arms, or those of the mask (N,), at rest at their rows of q (N, J), rad, and set their time to zero."""
+        """Put all arms, or those of the mask (N,), at rest at their rows of q (N, J), rad (m for a prismatic joint), at time zero."""
 
     @abstractmethod
     def step(self, q_target: Floats) -> SimState:
-        """Move all arms towards q_target (N, J), rad, for one control period, and return their state after it."""
+        """Move all arms towards q_target (N, J), rad (m for a prismatic joint), for one control period, and return the state after it."""
 
     @property
     @abstractmethod

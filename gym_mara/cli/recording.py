@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from gym_mara.backends import DEFAULT_BACKEND
-from gym_mara.cli.agents import SeedOption
 from gym_mara.cli.common import (
     EnvOption,
     RunBackendOption,
@@ -49,7 +48,14 @@ def record(
         int,
         typer.Option(parser=whole(1, 100_000), metavar="N", help="How many episodes to record."),
     ] = 10,
-    seed: SeedOption = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            parser=whole(0, 2**32 - 1),
+            metavar="N",
+            help="Seed of the episodes. None is an episode of an evaluation.",
+        ),
+    ] = 0,
     format: Annotated[  # noqa: A002 - the name of the option
         str,
         typer.Option(

@@ -41,8 +41,9 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         backend: the name of a backend.
         render_mode: "rgb_array" for pictures, "human" for a viewer in the browser, or None.
         **options: values of the task (`target_position`, `on_collision`, …), settings of the backend
-            (`max_joint_velocity`, …), of the actions (`action`, …), of the sensors (`velocity_filter`) and of the rendering
-            (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`).
+            (`max_joint_velocity`, …), of the actions (`action`, …), of the sensors (`velocity_filter`), of the rendering
+            (`width`, `camera`, …; `gym_mara.rendering.RenderSettings`) and of pictures as observations (`observation`,
+            `pixel_size`, …; `gym_mara.rendering.settings.PixelSettings`).
 
     Raises:
         GymMaraError: a name is unknown, or a value is out of its range.

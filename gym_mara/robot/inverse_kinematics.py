@@ -30,7 +30,7 @@ def solve_ik(
     quaternion: Floats | None,
     start: Floats | None = None,
 ) -> Floats:
-    """The configuration (J,), rad, within the limits, that comes closest to a pose, regardless of collisions.
+    """The configuration (J,), rad (m for a prismatic joint), within the limits, that comes closest to a pose, regardless of collisions.
 
     Closest means the least sum of squares of the position error, m, and the rotation error, rad.
 
@@ -38,7 +38,7 @@ def solve_ik(
         robot: the arm.
         position: of the end-effector frame in the world (3,), m; None if any position will do.
         quaternion: its orientation [w, x, y, z]; None if any orientation will do.
-        start: the configuration (J,) to search from first, rad, within the limits; None for home. A solution that the search
+        start: the configuration (J,) to search from first, rad (m), within the limits; None for home. A solution that the search
             finds from there is often, but not always, the nearest one.
     """
     # Imported here because that takes a third of a second, and few environments need it.

@@ -36,26 +36,31 @@ class RobotModel:
     """
 
     name: str
+    """The robot's name, as `load` takes it or as the URDF has it."""
     urdf: Path
     """The file that the arm was read from; MARA's for an arm composed of modules."""
     srdf: Path | None
+    """The SRDF that was read; None if there is none."""
     modules: tuple[str, ...]
     """The modules that the arm was composed of, from the base to the tool; empty otherwise."""
     xml: str
     """The URDF as text, with all joints off the chain fixed."""
     ee_frame: str
+    """The end-effector link."""
     joint_names: tuple[str, ...]
+    """The joints of the chain, from the base to the end effector."""
     followers: tuple[Follower, ...]
     """The joints off the chain that mimic one of it; in `model` they come after the chain, in this order."""
     lower: Floats
     """Lower position limits, rad (m for a prismatic joint)."""
     upper: Floats
+    """Upper position limits, rad (m for a prismatic joint)."""
     velocity_limit: Floats
-    """rad/s (m/s)."""
+    """Velocity limits, rad/s (m/s)."""
     effort_limit: Floats
-    """Nm (N)."""
+    """Effort limits, Nm (N)."""
     home: Floats
-    """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
+    """The start pose, rad (m): the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
     collision_pairs: frozenset[Pair]
     """The pairs of links that may collide."""
     excluded_pairs: Mapping[Pair, str]
@@ -149,8 +154,8 @@ class RobotModel:
     ) -> RobotModel:
         """Load an arm from your own files.
 
-        Meshes are looked for in `package_dirs`, beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH.
-        Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables
+        Meshes are looked for in `package_dirs`, beside the URDF, in the folders above it, and along ROS_PACKAGE_PATH and
+        AMENT_PREFIX_PATH. Links joined by one joint never collide. Links that touch at home do not collide either, unless an SRDF disables
         pairs of links.
 
         Args:
