@@ -31,12 +31,33 @@ _TRAVELLING = Preset(
         "policy_kwargs": {"net_arch": [64], "lstm_hidden_size": 64, "log_std_init": -1.5},
     },
 )
+# As for PPO, with a smaller network behind the memory.
+_ANY_TARGET = Preset(
+    num_envs=256,
+    policy="lstm",
+    normalise_observation=True,
+    arguments={
+        "n_steps": 16,
+        "batch_size": 1024,
+        "n_epochs": 3,
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "learning_rate": ((0.0, 1e-3), (1.0, 0.0)),
+        "clip_range": 0.2,
+        "policy_kwargs": {
+            "net_arch": [128],
+            "lstm_hidden_size": 128,
+            "log_std_init": -0.5,
+            "activation_fn": "ReLU",
+        },
+    },
+)
 
 ALGORITHM = Algorithm(
     name="ppo-lstm",
     summary="proximal policy optimisation with an LSTM, from sb3-contrib",
     target="sb3_contrib:RecurrentPPO",
-    presets={"tuned": Presets(_TELEPORTING, _TRAVELLING)},
+    presets={"tuned": Presets(_TELEPORTING, _TRAVELLING, {"any_target": _ANY_TARGET})},
     search_space=SearchSpace(
         arguments={
             "n_steps": [2, 4, 8],
