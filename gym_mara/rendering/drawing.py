@@ -74,6 +74,8 @@ class DrawingThread:
             del request, answer, function, arguments  # keep nothing of theirs alive
         for key in list(self._renderers):
             self._free(key)
+        for kind in Renderer.__subclasses__():
+            kind.close_idle()
 
     def _draw(self, key: int, make: Callable[[], Renderer], view: View) -> Picture:
         if key not in self._renderers:

@@ -45,3 +45,7 @@ class Renderer(ABC):
 
     def close(self) -> None:  # noqa: B027 - some renderers have nothing to free
         """Free the renderer's resources. No other method is called afterwards."""
+
+    @classmethod  # noqa: B027
+    def close_idle(cls) -> None:
+        """Free what closed renderers of this class have left for the next one."""

@@ -45,6 +45,8 @@ with suppress(ImportError):
     importlib.import_module("triton")
 
 _SAMPLES = 4
+_idle: list[pyvista.Plotter] = []
+"""The plotter of a renderer that was closed, for the next one. Mesa keeps 10 MB of address space of each window that is closed."""
 _process: int | None = None
 """The process that has loaded OpenGL; a fork of it inherits this value."""
 # Exits with 0 if VTK can draw. It runs in a process of its own, because VTK may crash where it finds no OpenGL.
@@ -94,9 +96,8 @@ class VtkRenderer(Renderer):
         _process = os.getpid()
         vtkObject.GlobalWarningDisplayOff()  # VTK warns of each display that it cannot open
         size = [self.width, self.height]
-        self._plotter = pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
-        self._plotter.set_background(BACKGROUND)
-        self._plotter.render_window.SetMultiSamples(_SAMPLES)
+        self._plotter = _idle.pop() if _idle else _plotter()
+        self._plotter.window_size = size
         self._meshes = [_polydata(part) for part in scene.parts]
         self._actors = [
             self._add_part(*pair) for pair in zip(scene.parts, self._meshes, strict=True)
@@ -189,7 +190,24 @@ class VtkRenderer(Renderer):
         return rows[::-1].copy()  # VTK's first row is the lowest
 
     def close(self) -> None:
-        self._plotter.close()
+        if _idle:
+            self._plotter.close()
+        else:
+            self._plotter.clear()
+            _idle.append(self._plotter)
+
+    @classmethod
+    def close_idle(cls) -> None:
+        while _idle:
+            _idle.pop().close()
+
+
+def _plotter() -> pyvista.Plotter:
+    """A plotter without lights and meshes."""
+    plotter = pyvista.Plotter(off_screen=True, lighting="none")
+    plotter.set_background(BACKGROUND)
+    plotter.render_window.SetMultiSamples(_SAMPLES)
+    return plotter
 
 
 @functools.cache

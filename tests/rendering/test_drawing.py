@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
 
@@ -169,9 +170,26 @@ def test_environments_that_are_dropped_without_close_leave_no_renderer(
     drawing, threads = drawing_thread(), threading.active_count()
     drawing.free(-1, wait=True)  # what was dropped before is freed by now
     before = drawing.live_renderers
-    for _ in range(20 if renderer == "vtk" else 50):  # VTK takes 0.3 s for a window
+    space = psutil.Process().memory_info().vms
+    for _ in range(20):
         draw(drawable(renderer, **arm))
     gc.collect()
     drawing.free(-1, wait=True)
     assert drawing.live_renderers == before
     assert threading.active_count() == threads
+    assert (
+        psutil.Process().memory_info().vms - space < 100e6
+    )  # each window of OpenGL in software takes 10 MB for ever
+
+
+def test_a_picture_is_the_same_after_those_of_other_scenes_and_sizes(renderer: str) -> None:
+    def drawn(**options: Any) -> NDArray[np.uint8]:
+        env = drawable(renderer, **options)
+        picture = draw(env)
+        env.close()
+        return picture
+
+    first, larger = drawn(), drawn(width=200)
+    drawn(robot="ur5", width=100)
+    np.testing.assert_array_equal(drawn(), first)
+    np.testing.assert_array_equal(drawn(width=200), larger)
