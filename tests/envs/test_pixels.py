@@ -242,6 +242,18 @@ def test_a_link_may_have_the_name_of_a_frame(tmp_path: Path) -> None:
     assert names[1].count("tool") == 2
 
 
+def test_a_joint_that_mimics_another_is_seen_where_it_follows(tmp_path: Path) -> None:
+    file = arms.arm_file(tmp_path, arms.arm(more=arms.FOLLOWER))
+    env = MaraEnv("MARA-v0", robot=str(file), ee_frame=arms.TOOL, pixel_camera="side", **ALL)
+    pixels, rows = env.simulation.pixels, []
+    assert pixels is not None
+    for j2 in (0.0, 1.8):  # the follower stands, then it hangs
+        seen: Any = env.reset(seed=0, options={"start_q": [0.0, j2, 0.0]})[0]
+        rows.append(np.nonzero(seen["segmentation"][..., 0] == pixels.segments.index("lf"))[0])
+    assert rows[1].mean() > rows[0].mean() + 3.0
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
