@@ -254,6 +254,23 @@ def test_a_joint_that_mimics_another_is_seen_where_it_follows(tmp_path: Path) ->
     env.close()
 
 
+def test_arms_of_more_links_than_a_byte_can_number_have_pictures_without_segments(
+    tmp_path: Path,
+) -> None:
+    box = '<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>'
+    more = "".join(
+        f'<link name="e{n}">{box}</link><joint name="f{n}" type="fixed"><parent link="base"/><child link="e{n}"/></joint>'
+        for n in range(253)  # with nothing, floor, target and tool one too many
+    )
+    robot = RobotModel.load(arms.arm_file(tmp_path, arms.arm(more=more)), arms.TOOL)
+    options = {**ALL, "robot": robot, "observation": "pixels"}
+    env = MaraEnv("MARA-v0", **{**options, "pixel_channels": ["rgb"]})
+    assert np.ptp(env.reset(seed=0)[0]) > 100
+    env.close()
+    with pytest.raises(GymMaraError, match=r"arm has 257 segments.*leave 'segmentation' out"):
+        MaraEnv("MARA-v0", **options)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
