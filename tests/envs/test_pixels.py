@@ -271,6 +271,14 @@ def test_arms_of_more_links_than_a_byte_can_number_have_pictures_without_segment
         MaraEnv("MARA-v0", **options)
 
 
+def test_a_camera_on_the_tool_that_sees_one_link_alone_says_where_it_looks(tmp_path: Path) -> None:
+    box = '<visual><origin xyz="-0.1 0 -0.08"/><geometry><box size="0.1 0.1 0.1"/></geometry></visual>'
+    text = arms.arm().replace('<link name="tool"/>', f'<link name="tool">{box}</link>')
+    robot = RobotModel.load(arms.arm_file(tmp_path, text), arms.TOOL)
+    with pytest.raises(GymMaraError, match=r"but 'tool'.*along z of .* 'tool'.*by ee_frame"):
+        MaraEnv("MARA-v0", robot=robot, pixel_camera="tool", **ALL)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -96,9 +96,14 @@ class BatchRenderer:
         where = f"the camera {self._settings.pixel_camera!r} of the observations"
         if len(seen) == 1 and seen[0] >= 0:
             inside = self._scene.parts[seen[0]].link
+            remedy = "move it away, or leave out pixel_camera"
+            if self._settings.pixel_camera == TOOL:
+                remedy = (
+                    f"it looks along z of the end-effector frame {self._scene.robot.ee_frame!r}; choose a link whose z points "
+                    "out of the hand by ee_frame, or another pixel_camera"
+                )
             raise GymMaraError(
-                f"{where} sees nothing but {inside!r}: it is inside it or right before it; move it away, or leave out "
-                "pixel_camera"
+                f"{where} sees nothing but {inside!r}: it is inside it or right before it; {remedy}"
             )
         if self._settings.pixel_camera != TOOL and not (seen >= 0).any():
             raise GymMaraError(
