@@ -12,7 +12,7 @@ import pytest
 from gym_mara.backends import simulated_backends, usable_backends
 from gym_mara.robot import RobotModel
 from tests.helpers import Cli, write
-from tests.robot.arms import FOLDED, LIMIT, TOOL, UPRIGHT_REACH, arm, arm_file
+from tests.robot.arms import FOLDED, FOLLOWER, LIMIT, TOOL, UPRIGHT_REACH, arm, arm_file
 
 
 def _json(gym_mara: Cli, *arguments: object) -> tuple[int, dict[str, Any]]:
@@ -156,9 +156,10 @@ def test_an_existing_file_is_never_overwritten(
     assert existing.read_text() == "mine"
 
 
-def test_the_picture_shows_the_arm(gym_mara: Cli, tmp_path: Path) -> None:
-    file = tmp_path / "arm.png"
-    assert gym_mara("robot", arm_file(tmp_path), "--ee-frame", TOOL, "--picture", file)[0] == 0
+@pytest.mark.parametrize("more", ["", FOLLOWER], ids=["chain", "follower"])
+def test_the_picture_shows_the_arm(gym_mara: Cli, tmp_path: Path, more: str) -> None:
+    file, urdf = tmp_path / "arm.png", arm_file(tmp_path, arm(more=more))
+    assert gym_mara("robot", urdf, "--ee-frame", TOOL, "--picture", file)[0] == 0
     picture = imageio.imread(file)
     assert picture.shape == (960, 1280, 3)
     assert (abs(picture.astype(int) - picture[0, 0]).max(axis=-1) > 60).mean() > 0.01

@@ -132,13 +132,20 @@ class Scene:
         for part, body, placement in zip(self.parts, self.body_of_part, self.on_body, strict=True):
             if not part.fixed and not part.marker:
                 vertices.setdefault(int(body) - 1, []).append(part.placed(placement))
-        if not vertices:
-            return np.empty((0, 3))
-        bodies = sorted(vertices, reverse=True)
-        boxes = [_corners(np.concatenate(vertices[body])) for body in bodies]
-        of_corners = np.repeat(bodies, 8).tolist()
-        points = self.robot.kinematics().points(q, of_corners, np.concatenate(boxes))
-        return points.reshape(-1, 3)
+        boxes = {body: _corners(np.concatenate(own)) for body, own in vertices.items()}
+        placed = [np.empty((0, 3))]
+        # `Kinematics` places the bodies of the chain; joints that mimic one of it come after it.
+        if chain := sorted((b for b in boxes if b < self.robot.num_joints), reverse=True):
+            corners = np.concatenate([boxes[body] for body in chain])
+            points = self.robot.kinematics().points(q, np.repeat(chain, 8).tolist(), corners)
+            placed.append(points.reshape(-1, 3))
+        if followers := [body for body in boxes if body >= self.robot.num_joints]:
+            for row in q:
+                pin.forwardKinematics(self._model, self._data, row)
+                for body in followers:
+                    at = self._data.oMi[body + 1]
+                    placed.append(boxes[body] @ at.rotation.T + at.translation)
+        return np.concatenate(placed)
 
 
 def _corners(points: NDArray[np.float32]) -> Floats:

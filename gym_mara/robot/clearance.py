@@ -47,6 +47,8 @@ class _Spheres(NamedTuple):
 class Clearance:
     """The distance of an arm's spheres from each other and from the boxes around fixed shapes.
 
+    Bodies that follow a joint of the chain have no spheres: JointFrames does not have where they are.
+
     Args:
         robot: the arm.
     """

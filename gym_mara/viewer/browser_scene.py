@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pinocchio as pin
 import viser
 
 from gym_mara.rendering.camera import BACKGROUND, VIEW_ANGLE, Camera
-from gym_mara.rendering.scene import Colour, Scene
+from gym_mara.rendering.scene import Colour, Part, Scene
 from gym_mara.rendering.view import View
 from gym_mara.types import Floats
 from gym_mara.viewer.gate import TARGET
@@ -51,22 +52,22 @@ class BrowserScene:
             position=view.target_position,
             wxyz=view.target_quaternion,
         )
-        self._nodes: dict[str, Any] = {"target": self.target}
+        self._nodes: dict[str, Any] = {TARGET: self.target}
         self._first_parts: dict[str, int] = {}
         self._meshes: list[Any] = []
         placements = scene.placements(view)
         for index, part in enumerate(scene.parts):
-            if part.link not in self._first_parts:
-                # The link's node has the pose of its first part.
-                self._first_parts[part.link] = index
-                if part.link not in self._nodes:
-                    node = server.scene.add_frame(f"/{part.link}", show_axes=False)
-                    self._nodes[part.link] = node
-            node_pose = placements[self._first_parts[part.link]]
+            name = _node(part)
+            if name not in self._first_parts:
+                # The node has the pose of its first part.
+                self._first_parts[name] = index
+                if name not in self._nodes:
+                    self._nodes[name] = server.scene.add_frame(name, show_axes=False)
+            node_pose = placements[self._first_parts[name]]
             wxyz, position = _pose(np.linalg.inv(node_pose) @ placements[index])
             self._meshes.append(
                 server.scene.add_mesh_simple(
-                    f"/{part.link}/{index}",
+                    f"{name}/{index}",
                     part.vertices,
                     part.faces,
                     color=_bytes(part.colour),
@@ -84,9 +85,9 @@ class BrowserScene:
         """Move the links to their poses in a view, and colour them. The target stays: the user may be dragging it."""
         placements = self._scene.placements(view)
         with self._server.atomic():
-            for link, first_part in self._first_parts.items():
-                if link != "target":
-                    node = self._nodes[link]
+            for name, first_part in self._first_parts.items():
+                if name != TARGET:
+                    node = self._nodes[name]
                     node.wxyz, node.position = _pose(placements[first_part])
             for index, colour in enumerate(self._scene.colours(view)):
                 if colour != self._colours[index]:
@@ -97,6 +98,14 @@ class BrowserScene:
         """Move the target to its pose in a view."""
         with self._server.atomic():
             self.target.position, self.target.wxyz = view.target_position, view.target_quaternion
+
+
+def _node(part: Part) -> str:
+    """The name of the node that carries a part: TARGET, "/tool", or one of its own for each link.
+
+    A slash in a link's name would make its node a child of another.
+    """
+    return f"/{part.link}" if part.marker else f"/links/{quote(part.link, safe='')}"
 
 
 def _bytes(colour: Colour) -> tuple[int, int, int]:

@@ -242,6 +242,43 @@ def test_a_link_may_have_the_name_of_a_frame(tmp_path: Path) -> None:
     assert names[1].count("tool") == 2
 
 
+def test_a_joint_that_mimics_another_is_seen_where_it_follows(tmp_path: Path) -> None:
+    file = arms.arm_file(tmp_path, arms.arm(more=arms.FOLLOWER))
+    env = MaraEnv("MARA-v0", robot=str(file), ee_frame=arms.TOOL, pixel_camera="side", **ALL)
+    pixels, rows = env.simulation.pixels, []
+    assert pixels is not None
+    for j2 in (0.0, 1.8):  # the follower stands, then it hangs
+        seen: Any = env.reset(seed=0, options={"start_q": [0.0, j2, 0.0]})[0]
+        rows.append(np.nonzero(seen["segmentation"][..., 0] == pixels.segments.index("lf"))[0])
+    assert rows[1].mean() > rows[0].mean() + 3.0
+    env.close()
+
+
+def test_arms_of_more_links_than_a_byte_can_number_have_pictures_without_segments(
+    tmp_path: Path,
+) -> None:
+    box = '<visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>'
+    more = "".join(
+        f'<link name="e{n}">{box}</link><joint name="f{n}" type="fixed"><parent link="base"/><child link="e{n}"/></joint>'
+        for n in range(253)  # with nothing, floor, target and tool one too many
+    )
+    robot = RobotModel.load(arms.arm_file(tmp_path, arms.arm(more=more)), arms.TOOL)
+    options = {**ALL, "robot": robot, "observation": "pixels"}
+    env = MaraEnv("MARA-v0", **{**options, "pixel_channels": ["rgb"]})
+    assert np.ptp(env.reset(seed=0)[0]) > 100
+    env.close()
+    with pytest.raises(GymMaraError, match=r"arm has 257 segments.*leave 'segmentation' out"):
+        MaraEnv("MARA-v0", **options)
+
+
+def test_a_camera_on_the_tool_that_sees_one_link_alone_says_where_it_looks(tmp_path: Path) -> None:
+    box = '<visual><origin xyz="-0.1 0 -0.08"/><geometry><box size="0.1 0.1 0.1"/></geometry></visual>'
+    text = arms.arm().replace('<link name="tool"/>', f'<link name="tool">{box}</link>')
+    robot = RobotModel.load(arms.arm_file(tmp_path, text), arms.TOOL)
+    with pytest.raises(GymMaraError, match=r"but 'tool'.*along z of .* 'tool'.*by ee_frame"):
+        MaraEnv("MARA-v0", robot=robot, pixel_camera="tool", **ALL)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from gym_mara import rendering
@@ -17,25 +19,29 @@ from gym_mara.rendering.camera import VIEW_ANGLE, Camera, place_camera
 from gym_mara.rendering.renderer import Renderer
 from gym_mara.rendering.scene import Scene
 from gym_mara.rendering.view import View
+from gym_mara.robot import RobotModel
 from gym_mara.testing import uniform_q
 from gym_mara.types import Floats
 from tests.helpers import MODULAR_ARMS, TARGET_Q, write
+from tests.robot import arms
 
 SIZES = ((640, 480), (300, 600), (1200, 300))
 
 
 def _arm(length: float, base: float) -> str:
-    """The URDF of an arm of this length, m, of three links, on a base of this height."""
+    """The URDF of an arm of this length, m, of three links and one that follows, on a base of this height."""
     part = length / 3.0
     link = '<link name="{}"><collision><origin xyz="0 0 {}"/><geometry><box size="{}"/></geometry></collision></link>'
     boxes = [link.format("base", -base / 2.0, f"{part} {part} {base}")]
     boxes += [
-        link.format(f"link{n}", part / 2.0, f"{part / 4} {part / 4} {0.9 * part}") for n in range(3)
+        link.format(f"link{n}", part / 2.0, f"{part / 4} {part / 4} {0.9 * part}") for n in range(4)
     ]
-    joint = """<joint name="joint{0}" type="revolute"><parent link="{1}"/><child link="link{0}"/><origin xyz="0 0 {2}"/>
-      <axis xyz="{3}"/><limit lower="-2" upper="2" effort="50" velocity="2"/></joint>"""
-    joints = [joint.format(0, "base", 0, "0 0 1")]
-    joints += [joint.format(n, f"link{n - 1}", part, "0 1 0") for n in (1, 2)]
+    joint = """<joint name="joint{0}" type="revolute"><parent link="{1}"/><child link="link{0}"/><origin xyz="{2}"/>
+      <axis xyz="{3}"/><limit lower="-2" upper="2" effort="50" velocity="2"/>{4}</joint>"""
+    joints = [joint.format(0, "base", "0 0 0", "0 0 1", "")]
+    joints += [joint.format(n, f"link{n - 1}", f"0 0 {part}", "0 1 0", "") for n in (1, 2)]
+    mimic = '<mimic joint="joint2" multiplier="-1"/>'
+    joints += [joint.format(3, "link1", f"0 {part} {part}", "0 1 0", mimic)]
     return f'<robot name="arm">{"".join(boxes + joints)}</robot>'
 
 
@@ -128,6 +134,23 @@ def test_the_whole_arm_and_its_base_are_in_every_picture(
             count += 1
             assert np.abs(_in_picture(bodies, placed, 640, 480)).max() <= 1.0
     assert count > 20
+
+
+def test_the_arm_is_looked_for_where_joints_that_mimic_others_follow(tmp_path: Path) -> None:
+    robot = RobotModel.load(arms.arm_file(tmp_path, arms.arm(more=arms.FOLLOWER)), arms.TOOL)
+    scene, data = Scene(robot), robot.model.createData()
+    for q in uniform_q(robot, 5, 0):
+        corners = scene.swept(q[None])
+        pin.forwardKinematics(robot.model, data, q)
+        expected = [  # the arm's shapes are boxes along the axes of their bodies
+            data.oMi[placed.parentJoint].act(placed.placement.act(np.array(corner)))
+            for placed in robot.geometry.geometryObjects
+            if placed.parentJoint
+            for corner in itertools.product((-0.03, 0.03), (-0.03, 0.03), (-0.11, 0.11))
+        ]
+        assert len(corners) == len(expected) == 4 * 8
+        apart = np.linalg.norm(corners[:, None] - np.array(expected), axis=-1)
+        assert apart.min(axis=0).max() < 1e-6
 
 
 def test_markers_are_in_proportion_to_the_arm(tmp_path: Path) -> None:

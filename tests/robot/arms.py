@@ -18,6 +18,12 @@ LIMIT = '<limit lower="-2" upper="2" effort="50" velocity="2"/>'
 ORIGINS = ('xyz="0 0 0.02"', 'xyz="0 0 0.3"', 'xyz="0 0 0.3"')
 FOLDED = ('xyz="0 0 0.02"', 'xyz="0 0 0.02"', 'xyz="0.04 0 0.3" rpy="0 3.14159265 0"')
 """The origins of its joints with the third link folded back beside the first, which it touches at home."""
+FOLLOWER = (
+    f'<link name="lf">{INERTIAL}{COLLISION}</link><joint name="jf" type="revolute"><parent link="l1"/><child link="lf"/>'
+    '<origin xyz="0.1 0.2 0.2"/><axis xyz="0 1 0"/><limit lower="-4" upper="4" effort="50" velocity="4"/>'
+    '<mimic joint="j2" multiplier="-1.5" offset="0.2"/></joint>'
+)
+"""A link beside the first one, whose joint mimics j2."""
 UPRIGHT_REACH = 0.92
 """The height of the tool at home, m."""
 

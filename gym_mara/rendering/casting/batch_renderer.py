@@ -27,6 +27,8 @@ _ARMS_PER_THREAD = 8
 """Fewer arms are drawn in one thread."""
 _TOOL_ANGLE = 70.0
 """Its vertical angle of view, deg."""
+_MOST_SEGMENTS = 256
+"""What a byte can number."""
 
 
 class BatchRenderer:
@@ -38,7 +40,7 @@ class BatchRenderer:
         first: the view that is used to place a named camera.
 
     Raises:
-        GymMaraError: a mesh of the robot cannot be read.
+        GymMaraError: a mesh of the robot cannot be read, or the arm has more segments than a segmentation can number.
     """
 
     def __init__(self, settings: PixelSettings, robot: RobotModel, first: View) -> None:
@@ -65,9 +67,14 @@ class BatchRenderer:
         seen = list(dict.fromkeys((part.link, part.marker) for part in parts))
         self.segments: tuple[str, ...] = ("nothing", "floor", *(link for link, _ in seen))
         """What each number of a segmentation stands for; the last two are the frames, also if a link has the name of one."""
-        # Of the part indices from -2 on.
+        if "segmentation" in settings.pixel_channels and len(self.segments) > _MOST_SEGMENTS:
+            raise GymMaraError(
+                f"{robot.name} has {len(self.segments)} segments, and a segmentation can number {_MOST_SEGMENTS}: leave "
+                "'segmentation' out of pixel_channels"
+            )
+        # Of the part indices from -2 on; larger numbers than a byte's if there is no segmentation.
         numbers = [0, 1, *(2 + seen.index((part.link, part.marker)) for part in parts)]
-        self._segment_of_part = np.array(numbers, np.uint8)
+        self._segment_of_part = np.array(numbers, np.min_scalar_type(max(numbers)))
         self.far = _farthest(self._camera, robot)
         """The largest depth, m: that of the background, too."""
         spaces: dict[str, Space[Any]] = {
@@ -89,9 +96,14 @@ class BatchRenderer:
         where = f"the camera {self._settings.pixel_camera!r} of the observations"
         if len(seen) == 1 and seen[0] >= 0:
             inside = self._scene.parts[seen[0]].link
+            remedy = "move it away, or leave out pixel_camera"
+            if self._settings.pixel_camera == TOOL:
+                remedy = (
+                    f"it looks along z of the end-effector frame {self._scene.robot.ee_frame!r}; choose a link whose z points "
+                    "out of the hand by ee_frame, or another pixel_camera"
+                )
             raise GymMaraError(
-                f"{where} sees nothing but {inside!r}: it is inside it or right before it; move it away, or leave out "
-                "pixel_camera"
+                f"{where} sees nothing but {inside!r}: it is inside it or right before it; {remedy}"
             )
         if self._settings.pixel_camera != TOOL and not (seen >= 0).any():
             raise GymMaraError(
