@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gym_mara.collision import CollisionChecker, make_checker
-from gym_mara.collision.free_poses import ROOM, FreePoses
+from gym_mara.collision.free_poses import FreePoses
+from gym_mara.collision.room import room_checker
 from gym_mara.deploy import OnnxPolicy
 from gym_mara.pretrained import pretrained_file
 from gym_mara.robot import RobotModel
@@ -99,8 +100,7 @@ def _ticks(
         step: how far a command is from where the arm is at most, rad: a new one at POLICY_RATE. Where it is infinite, the
             target is anywhere and changes each second.
     """
-    rng, exact = np.random.default_rng(0), make_checker("coal", robot)
-    free = exact.with_margin(np.full(robot.num_joints, ROOM)) or exact
+    rng, free = np.random.default_rng(0), room_checker(robot)
     low, high = reachable_range(robot)
     safety = SafetyFilter(robot, 1.0 / RATE, MotionLimits.of(robot), checker=checker)
     q, still, wall, cpu = robot.home, np.zeros(robot.num_joints), [], []

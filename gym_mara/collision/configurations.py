@@ -12,7 +12,8 @@ import numpy as np
 
 from gym_mara import rotations
 from gym_mara.collision.coal import CoalChecker
-from gym_mara.collision.free_poses import ROOM, straight_move
+from gym_mara.collision.free_poses import straight_move
+from gym_mara.collision.room import room_checker
 from gym_mara.robot import RobotModel
 from gym_mara.robot.joint_ranges import nearest_turns, reachable_range
 from gym_mara.types import Floats
@@ -43,7 +44,7 @@ class Configurations:
     def __init__(self, robot: RobotModel, orientation: bool) -> None:
         self._robot, self._kinematics = robot, robot.kinematics()
         self._free = CoalChecker(robot)
-        self._with_room = self._free.with_margin(np.full(robot.num_joints, ROOM))
+        self._with_room = room_checker(robot)
         self._low, self._high = reachable_range(robot)
         self._rows = 6 if orientation else 3
         starts = (STARTS, robot.num_joints)
@@ -52,7 +53,7 @@ class Configurations:
     def __call__(self, position: Floats, quaternion: Floats | None, start: Floats) -> Floats:
         """Configurations (N, STARTS, J), rad (m), of poses; infinite where the search ends elsewhere or in a collision.
 
-        Each joint can turn by ROOM around them without a collision, and has the whole turns that bring it nearest to the start.
+        They have room around them (`room_checker`), and each joint has the whole turns that bring it nearest to the start.
         On the straight way from the start to the nearest one there is no collision, unless there is one on the ways to all
         that were tried: nearer ones are left out.
 

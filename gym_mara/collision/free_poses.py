@@ -8,16 +8,17 @@ import numpy as np
 
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.coal import CoalChecker
+from gym_mara.collision.room import ROOM, room_checker
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.joint_ranges import reachable_range
 from gym_mara.types import Floats
 
 _TRIES = 10_000
-ROOM = 0.02
-"""Around the start and the end of a move each joint can turn so far without a collision, rad (m)."""
 _STEP = 0.05
 """How far a joint moves at most between two checks of a move, rad (m)."""
+_FARTHEST = 1000.0
+"""How far a joint moves at most in a move that is checked, rad (m)."""
 
 
 class FreePoses:
@@ -30,7 +31,7 @@ class FreePoses:
     def __init__(self, robot: RobotModel) -> None:
         self._robot = robot
         self._checker = CoalChecker(robot)
-        self._with_room = self._checker.with_margin(np.full(robot.num_joints, ROOM))
+        self._with_room = room_checker(robot)
         self._kinematics = robot.kinematics()
         self._low, self._high = reachable_range(robot)
 
@@ -47,15 +48,17 @@ class FreePoses:
     ) -> tuple[Floats, Floats, Floats]:
         """A start (J,), rad, unless it is given, and a pose to which a free joint move leads.
 
-        Both configurations are drawn uniformly from those with ROOM around them.
+        Both configurations are drawn uniformly from those with room around them (`room_checker`).
 
         Returns:
             The start; and the pose, position (3,), m, and quaternion (4,), [w, x, y, z], of another configuration. No collision
             is on the straight joint move from the one to the other, checked every _STEP.
 
         Raises:
-            GymMaraError: no free configuration, or none with a free move, is found.
+            GymMaraError: no free configuration, or none with room or with a free move, is found; or a joint's range is so large
+                that moves are too long to check.
         """
+        _check_length(self._high - self._low)
         for _ in range(_TRIES):
             begin = start
             if begin is None:
@@ -79,17 +82,43 @@ class FreePoses:
             q = generator.uniform(self._low, self._high)
             if not checker.check(q[None])[0]:
                 return q
-        raise GymMaraError(
-            f"{self._robot.name} collides at all of {_TRIES} random configurations; "
+        raise GymMaraError(self._why_none(exact=checker is self._checker))
+
+    def _why_none(self, exact: bool) -> str:
+        name, free = self._robot.name, 0.0
+        if not exact:
+            q = np.random.default_rng(0).uniform(self._low, self._high, (_TRIES, len(self._low)))
+            free = float(np.mean(~self._checker.check(q)))
+        if free > 0.0:
+            return (
+                f"{name} is free at {100.0 * free:.3g} % of random configurations, but has room at none of {_TRIES}: something "
+                f"collides if its joints move by {ROOM} rad (m); disable pairs of links that never touch in its SRDF"
+            )
+        return (
+            f"{name} collides at all of {_TRIES} random configurations; "
             "check which pairs of links its SRDF disables"
         )
 
 
 def straight_move(begin: Floats, end: Floats) -> Floats:
-    """The configurations before the end of a straight joint move (K, J), at most _STEP apart; the first one if it ends there."""
+    """The configurations before the end of a straight joint move (K, J), at most _STEP apart; the first one if it ends there.
+
+    Raises:
+        GymMaraError: a joint moves by more than _FARTHEST.
+    """
     way = end - begin
+    _check_length(way)
     count = max(1, math.ceil(float(np.abs(way).max()) / _STEP))
     return begin + np.linspace(0.0, 1.0, count + 1)[:-1, None] * way
+
+
+def _check_length(way: Floats) -> None:
+    joint = int(np.abs(way).argmax())
+    if abs(way[joint]) > _FARTHEST:
+        raise GymMaraError(
+            f"joint {joint}, counted from 0, can move by {abs(way[joint]):g} rad (m), and a straight joint move is checked for "
+            f"collisions up to {_FARTHEST:g}: give the joint its true limits in the URDF"
+        )
 
 
 def reachable_pose(robot: RobotModel) -> tuple[Floats, Floats]:

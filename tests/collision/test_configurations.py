@@ -8,7 +8,7 @@ import pytest
 from gym_mara import rotations
 from gym_mara.collision.coal import CoalChecker
 from gym_mara.collision.configurations import STARTS, Configurations
-from gym_mara.collision.free_poses import ROOM
+from gym_mara.collision.room import ROOM
 from gym_mara.robot import RobotModel
 from gym_mara.testing import uniform_q
 from gym_mara.types import Floats

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gym_mara.collision import make_checker
-from gym_mara.collision.free_poses import ROOM, FreePoses, reachable_pose
+from gym_mara.collision.free_poses import FreePoses, reachable_pose
+from gym_mara.collision.room import ROOM
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.catalog import robot_names
