@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from gym_mara.errors import LARGEST
+from gym_mara.errors import LARGEST, SMALLEST
 from gym_mara.robot.description.off_chain import Follower
-from gym_mara.robot.diagnosis.finding import Finding, listed, parts
+from gym_mara.robot.diagnosis.finding import Finding, Severity, listed, parts
 from gym_mara.robot.diagnosis.sampling import random_configurations
 from gym_mara.types import Mask
 
@@ -116,7 +116,7 @@ def _limits(robot: RobotModel) -> Iterator[Finding]:
     for word, (unit, standing, endless) in effects.items():
         limits = getattr(robot, f"{word}_limit")
         for which, message, effect, verb in (
-            (limits <= 0.0, f"{word} limit 0", standing, "Correct"),
+            (limits < SMALLEST, f"{word} limit 0", standing, "Correct"),
             (limits >= LARGEST, f"no {word} limit", endless, "Add"),
         ):
             if names := _named(robot, which):
@@ -124,6 +124,19 @@ def _limits(robot: RobotModel) -> Iterator[Finding]:
                 yield Finding(
                     "error", parts("joint", names), message, effect, remedy, dynamics=True
                 )
+    unstated: tuple[tuple[Mask, Severity, str], ...] = (
+        (robot.velocity_limit < SMALLEST, "warning", "velocity limit 0"),
+        (robot.velocity_limit >= LARGEST, "note", "no velocity limit"),
+    )
+    for which, severity, message in unstated:
+        if names := _named(robot, which):
+            yield Finding(
+                severity,
+                parts("joint", names),
+                message,
+                "where joints jump to their targets it counts as 1 rad/s (m/s)",
+                "Correct <limit>, or give velocity_limit=… (rad/s)",
+            )
 
 
 def _too_weak(robot: RobotModel) -> Iterator[Finding]:
