@@ -55,7 +55,7 @@ class RobotModel:
     effort_limit: Floats
     """Nm (N)."""
     home: Floats
-    """The start pose: the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
+    """The start pose: the SRDF's first pose that names every joint, or zeros, within the limits by whole turns, or else clipped."""
     collision_pairs: frozenset[Pair]
     """The pairs of links that may collide."""
     excluded_pairs: Mapping[Pair, str]

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import LARGEST, SMALLEST
+from gym_mara.robot.description.joints import ROUNDED
 from gym_mara.robot.description.off_chain import Follower
 from gym_mara.robot.diagnosis.finding import Finding, Severity, listed, parts
 from gym_mara.robot.diagnosis.sampling import random_configurations
@@ -24,8 +25,6 @@ _POSES = 200
 """The number of random poses in which the motors must hold the arm."""
 _LIGHTEST = 0.05
 """A body with less mass and without shapes may be driven along unnoticed, kg."""
-_BEYOND = 1e-3
-"""A position this little beyond a limit is rounded, rad (m)."""
 
 
 def joint_findings(robot: RobotModel) -> list[Finding]:
@@ -72,7 +71,7 @@ def range_findings(
         ends = model.lowerPositionLimit[follower.leader], model.upperPositionLimit[follower.leader]
         low, high = sorted(follower.multiplier * end + follower.offset for end in ends)
         own = written.get(follower.name, {})
-        if low < own.get("lower", low) - _BEYOND or high > own.get("upper", high) + _BEYOND:
+        if low < own.get("lower", low) - ROUNDED or high > own.get("upper", high) + ROUNDED:
             beyond.append(follower.name)
     if beyond:
         findings.append(
