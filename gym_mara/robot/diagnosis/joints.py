@@ -14,6 +14,7 @@ from gym_mara.robot.description.joints import ROUNDED
 from gym_mara.robot.description.off_chain import Follower
 from gym_mara.robot.diagnosis.finding import Finding, Severity, listed, parts
 from gym_mara.robot.diagnosis.sampling import random_configurations
+from gym_mara.robot.joint_ranges import FARTHEST_TRAVEL, TRAVEL, unlimited
 from gym_mara.types import Mask
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ _LIGHTEST = 0.05
 
 def joint_findings(robot: RobotModel) -> list[Finding]:
     """The findings about the joints of a loaded arm."""
-    return [*_frozen(robot), *_limits(robot), *_too_weak(robot), *_driven_along(robot)]
+    findings = _frozen(robot), _unlimited(robot), _limits(robot), _too_weak(robot)
+    return [finding for kind in (*findings, _driven_along(robot)) for finding in kind]
 
 
 def written_limits(root: ElementTree.Element) -> dict[str, dict[str, float]]:
@@ -99,6 +101,27 @@ def _frozen(robot: RobotModel) -> Iterator[Finding]:
             "the lower limit equals the upper limit, or both are missing",
             "the arm cannot move" if every else "it never moves",
             'Correct the limits, or make the joint type="continuous" or "fixed"',
+        )
+
+
+def _unlimited(robot: RobotModel) -> Iterator[Finding]:
+    """Position limits that mean none, or that are in degrees or mm."""
+    far, prismatic = unlimited(robot), robot.kinematics().prismatic
+    if names := _named(robot, far & ~prismatic):
+        yield Finding(
+            "warning",
+            parts("joint", names),
+            "the limits are beyond ±8π rad: are they in degrees, or does it turn without end?",
+            "actions and targets have one turn of it",
+            'Correct the limits, rad, or make the joint type="continuous"',
+        )
+    if names := _named(robot, far & prismatic):
+        yield Finding(
+            "warning",
+            parts("joint", names),
+            f"the limits are beyond ±{FARTHEST_TRAVEL:g} m",
+            f"actions and targets have {TRAVEL:g} m of it",
+            "Correct the limits, m",
         )
 
 
