@@ -30,7 +30,7 @@ from gym_mara.robot.diagnosis import (
     joint_findings,
     range_findings,
     semantics_findings,
-    written_limits,
+    written_joints,
 )
 from gym_mara.robot.geometry import read_geometry
 from gym_mara.robot.inertia import add_inertias
@@ -110,7 +110,7 @@ def _build(
     """The arm of a URDF that has been read, without findings."""
     empty = drop_empty_shapes(root)
     chain = find_chain(urdf, root, ee_frame)
-    written = written_limits(root)
+    written = written_joints(root)
     followers = keep_chain(urdf, root, chain, semantics.home_pose(chain).values)
     model, of_parser = build(urdf, root, chain, followers)
     xml = ElementTree.tostring(root, encoding="unicode")

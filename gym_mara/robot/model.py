@@ -156,7 +156,8 @@ class RobotModel:
         Args:
             urdf: path of the URDF file.
             ee_frame: the end-effector link; by default the one that the SRDF names.
-            srdf: path of the SRDF file: disabled collisions, home pose, end effector.
+            srdf: path of the SRDF file: disabled collisions, home pose, end effector. None for none: unlike `load`, this does not
+                read the one beside the URDF.
             name: the robot's name; by default the one in the URDF.
             **options: fields of `RobotOptions`.
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import LARGEST, SMALLEST
-from gym_mara.robot.description.joints import ROUNDED
-from gym_mara.robot.description.off_chain import Follower
 from gym_mara.robot.diagnosis.finding import Finding, Severity, listed, parts
 from gym_mara.robot.diagnosis.sampling import random_configurations
 from gym_mara.robot.joint_ranges import FARTHEST_TRAVEL, TRAVEL, unlimited
@@ -32,60 +29,6 @@ def joint_findings(robot: RobotModel) -> list[Finding]:
     """The findings about the joints of a loaded arm."""
     findings = _frozen(robot), _unlimited(robot), _limits(robot), _too_weak(robot)
     return [finding for kind in (*findings, _driven_along(robot)) for finding in kind]
-
-
-def written_limits(root: ElementTree.Element) -> dict[str, dict[str, float]]:
-    """The position limits "lower" and "upper" that a URDF writes, by joint; continuous joints need none."""
-    limited = (j for j in root.findall("joint") if j.get("type") in ("revolute", "prismatic"))
-    return {
-        joint.get("name", ""): {
-            end: float(limit.get(end, "0")) for end in ("lower", "upper") if end in limit.attrib
-        }
-        for joint in limited
-        for limit in joint.findall("limit")
-    }
-
-
-def range_findings(
-    written: Mapping[str, Mapping[str, float]],
-    chain: Sequence[str],
-    followers: Sequence[Follower],
-    model: pin.Model,
-) -> list[Finding]:
-    """The findings about position limits that are not in a loaded arm any more.
-
-    Args:
-        written: the limits of the URDF, see `written_limits`.
-        chain: the names of the joints of the chain.
-        followers: the joints that mimic one of it.
-        model: Pinocchio's model.
-    """
-    findings = []
-    for end, other in ("lower", "upper"), ("upper", "lower"):
-        if names := [n for n in chain if len(written.get(n, {})) == 1 and end not in written[n]]:
-            remedy = f'Add {end}="…" to <limit>'
-            message = f"<limit> has {other}=, but no {end}="
-            findings.append(
-                Finding("warning", parts("joint", names), message, "it counts as 0", remedy)
-            )
-    beyond = []
-    for follower in followers:
-        ends = model.lowerPositionLimit[follower.leader], model.upperPositionLimit[follower.leader]
-        low, high = sorted(follower.multiplier * end + follower.offset for end in ends)
-        own = written.get(follower.name, {})
-        if low < own.get("lower", low) - ROUNDED or high > own.get("upper", high) + ROUNDED:
-            beyond.append(follower.name)
-    if beyond:
-        findings.append(
-            Finding(
-                "note",
-                parts("joint", beyond),
-                "the range of the joint that it mimics moves it beyond its own limits",
-                "its own limits do not count",
-                "Correct <limit> or <mimic>, unless this is meant",
-            )
-        )
-    return findings
 
 
 def _named(robot: RobotModel, which: Mask) -> list[str]:

@@ -56,6 +56,16 @@ def _unknown_names(
 
 def _home(robot: RobotModel, semantics: Semantics) -> Iterator[Finding]:
     pose = semantics.home_pose(robot.joint_names)
+    partial = [each for each in semantics.poses if each.values.keys() & set(robot.joint_names)]
+    if partial and not pose.values:
+        lacking = [joint for joint in robot.joint_names if joint not in partial[0].values]
+        yield Finding(
+            "note",
+            f"SRDF {str(robot.srdf)!r}",
+            f"no pose names every joint of the chain; {partial[0].name!r} lacks {listed(lacking)}",
+            "the start pose is zero, within the limits",
+            "Add the joints to a pose, or give start_q=[…]",
+        )
     way = np.subtract(semantics.home(robot.joint_names), robot.home)
     turned = np.where(robot.kinematics().prismatic, way, way - _TURN * np.round(way / _TURN))
     beyond = np.abs(turned) > ROUNDED

@@ -44,7 +44,7 @@ def test_only_backends_with_dynamics_refuse_limits_that_are_zero_or_missing(
 def test_limits_that_are_given_mend_them(tmp_path: Path) -> None:
     urdf = arm_file(tmp_path, FAULTS["no effort"][0])
     robot = RobotModel.load(urdf, TOOL, effort_limit=50, velocity_limit=2)
-    assert robot.findings == ()
+    assert [f.message for f in robot.findings] == ["continuous, without end stops"]
 
 
 @pytest.mark.parametrize(
