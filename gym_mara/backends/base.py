@@ -8,10 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.errors import LARGEST, GymMaraError, positive_number
+from gym_mara.errors import LARGEST, SMALLEST, GymMaraError, positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.state import SimState
 from gym_mara.types import Array, Floats, Mask
+
+_NOT_STATED = 1.0
+"""The velocity of a joint that teleports and whose limit is 0 or missing, rad/s (m/s)."""
 
 
 class Backend(ABC):
@@ -133,10 +136,19 @@ def limited_velocity(robot: RobotModel, max_joint_velocity: float | None) -> Flo
     limit = LARGEST
     if max_joint_velocity is not None:
         limit = positive_number("max_joint_velocity", max_joint_velocity, "rad/s")
-    if not (robot.velocity_limit > 0.0).all():
-        joint = robot.joint_names[int((robot.velocity_limit > 0.0).argmin())]
+    if (robot.velocity_limit < SMALLEST).any():
+        joint = robot.joint_names[int(robot.velocity_limit.argmin())]
         raise GymMaraError(
             f"joint {joint} of {robot.name} cannot move at a limited velocity, because its velocity limit is 0: correct the "
             f"URDF, or give velocity_limit={{{joint!r}: …}}, rad/s (m/s)"
         )
     return np.minimum(limit, robot.velocity_limit)
+
+
+def stated_velocity(velocity: Floats) -> Floats:
+    """Velocity limits (J,), rad/s (m/s), for joints that teleport: 1 in place of those that are 0 or missing.
+
+    Nothing moves so fast there, but steps of joints and bounds of observations need a number.
+    """
+    stated = (velocity >= SMALLEST) & (velocity < LARGEST)
+    return np.where(stated, velocity, _NOT_STATED)

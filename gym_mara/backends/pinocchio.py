@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from gym_mara.backends.base import Backend, limited_velocity
+from gym_mara.backends.base import Backend, limited_velocity, stated_velocity
 from gym_mara.backends.servo_motion import servo_motion
 from gym_mara.collision import make_checker
 from gym_mara.collision.base import CollisionChecker
 from gym_mara.collision.cached import CachedChecker
 from gym_mara.collision.coal import CoalChecker, ParallelCoalChecker
-from gym_mara.errors import LARGEST, positive_number
+from gym_mara.errors import positive_number
 from gym_mara.robot import RobotModel
 from gym_mara.snapshots import check_fits
 from gym_mara.state import SimState
@@ -21,8 +21,6 @@ from gym_mara.types import Floats, Mask
 
 CACHE_FROM = 16
 """From this number of arms on a cached checker is faster."""
-_UNLIMITED = 1.0
-"""The velocity for the bounds of a joint without limit that teleports, rad/s (m/s)."""
 _STATE = ("q", "qd", "time", "collided", "touching")
 
 
@@ -68,9 +66,8 @@ class PinocchioBackend(Backend):
             self.servo_gain = positive_number("servo_gain", servo_gain, "1/s")
         if not self.teleports:
             self.joint_velocity = limited_velocity(robot, max_joint_velocity)
-        else:  # the velocities are 0, but without a limit their bounds would be huge
-            limit = robot.velocity_limit
-            self.joint_velocity = np.where(limit < LARGEST, limit, _UNLIMITED)
+        else:
+            self.joint_velocity = stated_velocity(robot.velocity_limit)
         self._furthest = self.joint_velocity * self.control_period
         self.path_resolution = positive_number(
             "path_resolution",

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara import rotations
+from gym_mara.robot.joint_ranges import useful_limits
 from gym_mara.robot.model import RobotModel
 from gym_mara.types import Floats
 
@@ -81,8 +82,9 @@ def _starts(
     # whole travel.
     high = np.minimum(robot.upper, np.maximum(robot.lower, -np.pi) + 2.0 * np.pi)
     low = np.maximum(robot.lower, high - 2.0 * np.pi)
-    slides = kinematics.prismatic & np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    low, high = np.where(slides, robot.lower, low), np.where(slides, robot.upper, high)
+    lower, upper = useful_limits(robot)
+    slides = kinematics.prismatic & np.isfinite(lower) & np.isfinite(upper)
+    low, high = np.where(slides, lower, low), np.where(slides, upper, high)
     random = np.random.default_rng(0).uniform(low, high, (_STARTS, robot.num_joints))
     positions, quaternions = kinematics.pose(random)
     distance = np.zeros(_STARTS)

@@ -10,11 +10,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pinocchio as pin
 
 from gym_mara.robot import catalog
 from gym_mara.robot.collision_pairs import set_collision_pairs
 from gym_mara.robot.description.checks import check_urdf
 from gym_mara.robot.description.empty_shapes import drop_empty_shapes
+from gym_mara.robot.description.joints import within_limits
 from gym_mara.robot.description.modules import EE_FRAME, MARA, compose
 from gym_mara.robot.description.off_chain import keep_chain
 from gym_mara.robot.description.srdf import Semantics, read_srdf
@@ -28,10 +30,11 @@ from gym_mara.robot.diagnosis import (
     joint_findings,
     range_findings,
     semantics_findings,
-    written_limits,
+    written_joints,
 )
 from gym_mara.robot.geometry import read_geometry
 from gym_mara.robot.inertia import add_inertias
+from gym_mara.robot.kinematics import motion_axis
 from gym_mara.robot.options import RobotOptions
 from gym_mara.types import Floats
 
@@ -107,7 +110,7 @@ def _build(
     """The arm of a URDF that has been read, without findings."""
     empty = drop_empty_shapes(root)
     chain = find_chain(urdf, root, ee_frame)
-    written = written_limits(root)
+    written = written_joints(root)
     followers = keep_chain(urdf, root, chain, semantics.home_pose(chain).values)
     model, of_parser = build(urdf, root, chain, followers)
     xml = ElementTree.tostring(root, encoding="unicode")
@@ -117,7 +120,7 @@ def _build(
     options.apply_limits(model, chain)
     if options.default_mass is not None:
         add_inertias(model, geometry, shapes, options.default_mass)
-    home = np.clip(semantics.home(chain), model.lowerPositionLimit, model.upperPositionLimit)
+    home = _home(semantics.home(chain), model)
     pairs = set_collision_pairs(root, semantics, model, geometry, home)
     return cls(
         name=name or root.get("name") or urdf.stem,
@@ -142,6 +145,14 @@ def _build(
         options=options,
         findings=(*empty, *of_parser, *range_findings(written, chain, followers, model)),
     )
+
+
+def _home(pose: Sequence[float], model: pin.Model) -> Floats:
+    """A pose of the chain (J,), rad (m), within the limits of Pinocchio's model."""
+    limits = model.lowerPositionLimit.tolist(), model.upperPositionLimit.tolist()
+    turns = (bool(motion_axis(joint)[3:].any()) for joint in model.joints[1:])
+    joints = zip(pose, *limits, turns, strict=False)  # those that follow come last
+    return np.array([within_limits(at, low, high, turns=turn) for at, low, high, turn in joints])
 
 
 def _with_findings(

@@ -60,7 +60,7 @@ class RobotModel:
     effort_limit: Floats
     """Effort limits, Nm (N)."""
     home: Floats
-    """The start pose, rad (m): the SRDF's first pose that names every joint, or zeros, clipped to the limits."""
+    """The start pose, rad (m): the SRDF's first pose that names every joint, or zeros, within the limits by whole turns, or else clipped."""
     collision_pairs: frozenset[Pair]
     """The pairs of links that may collide."""
     excluded_pairs: Mapping[Pair, str]
@@ -161,7 +161,8 @@ class RobotModel:
         Args:
             urdf: path of the URDF file.
             ee_frame: the end-effector link; by default the one that the SRDF names.
-            srdf: path of the SRDF file: disabled collisions, home pose, end effector.
+            srdf: path of the SRDF file: disabled collisions, home pose, end effector. None for none: unlike `load`, this does not
+                read the one beside the URDF.
             name: the robot's name; by default the one in the URDF.
             **options: fields of `RobotOptions`.
 

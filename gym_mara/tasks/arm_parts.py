@@ -12,6 +12,7 @@ import numpy as np
 
 from gym_mara import rotations
 from gym_mara.arrays import Constants
+from gym_mara.errors import SMALLEST
 from gym_mara.robot.clearance import FAR, Clearance
 from gym_mara.robot.kinematics import JointFrames
 from gym_mara.state import SimState
@@ -67,7 +68,7 @@ class ArmParts:
         slides = self._kinematics.prismatic.astype(np.float64)
         rows = np.array([1.0] * 3 + [length_per_angle] * 3)[: 6 if orientation else 3]
         damping = DAMPING**2 * np.eye(len(rows))
-        step = STEP_TIME * joint_velocity
+        step = STEP_TIME * np.maximum(joint_velocity, SMALLEST)  # it divides
         self._constants = Constants(slides, rows[:, None], damping, step, _SMALL, _LEVER)
         self._limits = Constants(robot.lower + _AT_LIMIT, robot.upper - _AT_LIMIT)
         self._pace = Constants(length_per_angle, slow_within, 1.0)

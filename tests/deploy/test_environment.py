@@ -69,6 +69,7 @@ def test_a_target_at_the_end_of_the_travel_moves_a_joint_as_fast_as_a_far_one() 
     assert moved[2] < 0.9 * moved[0]
 
 
+@pytest.mark.filterwarnings("ignore:.*velocity limit 0")
 def test_a_prismatic_joint_is_in_metres_and_may_have_no_limit_of_velocity(tmp_path: Path) -> None:
     unlimited = '<limit lower="0" upper="0.5" effort="10" velocity="0"/>'
     arm = urdf_xml(joint_xml(0), joint_xml(1, "prismatic", limit=unlimited), joint_xml(2))

@@ -38,6 +38,38 @@ def test_a_joint_with_limits_beyond_pi_has_its_whole_range(
         assert env.simulation.backend.state.q[0, 0] == pytest.approx(end, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("kind", "lower", "upper", "low", "high"),
+    [
+        ("revolute", -1e9, 1e9, -np.pi, np.pi),
+        ("revolute", -170.0, 170.0, -np.pi, np.pi),  # in degrees
+        ("revolute", 0.0, 360.0, 0.0, 2 * np.pi),
+        ("prismatic", -999999.0, 999999.0, -5.0, 5.0),
+        ("prismatic", 0.0, 1e6, 0.0, 10.0),
+    ],
+)
+def test_of_limits_that_mean_none_a_turn_or_ten_metres_are_used(
+    tmp_path: Path, kind: str, lower: float, upper: float, low: float, high: float
+) -> None:
+    with pytest.warns(UserWarning, match="joint joint0: the limits are beyond"):
+        arm = _arm(tmp_path, lower, upper, kind)
+    assert (arm.lower[0], arm.upper[0]) == (lower, upper)
+    for ends in (action_range(arm), reachable_range(arm)):
+        np.testing.assert_allclose([end[0] for end in ends], [low, high])
+    poses = FreePoses(arm)
+    for seed in range(3):
+        begin, position, quaternion = poses.draw_move(np.random.default_rng(seed))
+        assert low <= begin[0] <= high
+        assert max(miss(arm, position, quaternion)) < 1e-6
+    assert arm.checked_q([upper, 0.0], "start_q")[0] == upper
+
+
+@pytest.mark.parametrize(("kind", "far"), [("revolute", 8 * np.pi), ("prismatic", 1000.0)])
+def test_long_ranges_that_an_arm_may_have_are_whole(tmp_path: Path, kind: str, far: float) -> None:
+    arm = _arm(tmp_path, -far, far, kind)  # a test fails by a warning
+    assert [end[0] for end in action_range(arm)] == [-far, far]
+
+
 def test_any_other_revolute_joint_has_pi_and_reaches_its_limits(tmp_path: Path) -> None:
     arm = _arm(tmp_path, -1.0, 2.0)
     assert [end[0] for end in action_range(arm)] == [-np.pi, np.pi]

@@ -61,6 +61,34 @@ def test_home_is_the_nearest_to_zero_within_the_limits(tmp_path: Path) -> None:
     np.testing.assert_array_equal(robot.home, [0.0, 0.5])
 
 
+@pytest.mark.parametrize(
+    ("kind", "value", "home"),
+    [
+        ("revolute", 7.0, 7.0 - 2 * np.pi),
+        ("revolute", -6.0, 2 * np.pi - 6.0),
+        ("revolute", 12.0, 12.0 - 4 * np.pi),
+        ("revolute", 1.5005, 1.5),  # rounded
+        ("continuous", 4.0, 4.0 - 2 * np.pi),
+        ("continuous", 3.1416, np.pi),
+    ],
+)
+def test_whole_turns_bring_a_home_pose_within_the_limits(
+    tmp_path: Path, kind: str, value: float, home: float
+) -> None:
+    pose = f'<group_state name="rest"><joint name="joint0" value="{value}"/></group_state>'
+    write(tmp_path / "stick.srdf", f'<robot name="stick">{pose}</robot>')
+    robot = _load(tmp_path, urdf_xml(joint_xml(0, kind)), "link1")  # a test fails by a warning
+    np.testing.assert_allclose(robot.home, [home], atol=1e-12)
+
+
+def test_no_turn_is_added_to_a_prismatic_joint(tmp_path: Path) -> None:
+    pose = '<group_state name="rest"><joint name="joint0" value="7"/></group_state>'
+    write(tmp_path / "stick.srdf", f'<robot name="stick">{pose}</robot>')
+    with pytest.warns(UserWarning, match="joint joint0: the SRDF's pose 'rest' puts it beyond"):
+        robot = _load(tmp_path, urdf_xml(joint_xml(0, "prismatic")), "link1")
+    np.testing.assert_array_equal(robot.home, [1.5])
+
+
 def test_a_continuous_joint_turns_between_minus_pi_and_pi(tmp_path: Path) -> None:
     robot = _load(tmp_path, urdf_xml(joint_xml(0, "continuous"), joint_xml(1)))
     assert (robot.lower[0], robot.upper[0]) == (-np.pi, np.pi)
@@ -86,7 +114,7 @@ def test_an_srdf_beside_the_urdf_says_pose_end_effector_and_pairs(tmp_path: Path
         """<robot name="stick">
           <group_state name="partly" group="arm"><joint name="joint0" value="9"/></group_state>
           <group_state name="rest" group="arm">
-            <joint name="joint0" value="0.25"/><joint name="joint1" value="7"/>
+            <joint name="joint0" value="0.25"/><joint name="joint1" value="2"/>
           </group_state>
           <end_effector name="hand" parent_link="link2" group="arm"/>
           <disable_collisions link1="link2" link2="link0"/>

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gym_mara.backends.base import Backend, limited_velocity
+from gym_mara.backends.base import Backend, limited_velocity, stated_velocity
 from gym_mara.backends.randomisation import Randomisation
 from gym_mara.backends.servo import ON_DIVERGENCE, late_periods, made_again, simulation_diverged
 from gym_mara.backends.servo_motion import step_times
@@ -40,8 +40,6 @@ SERVO_GAIN = 10.0
 """The gain of servos with dynamics, 1/s: that of the other dynamic backends."""
 OF_MODEL = frozenset(("mass", "effort_limit", "joint_friction", "contact_friction"))
 """The parameters that the model on the device has; the servos and the sensors have the others."""
-_UNLIMITED = 1.0
-"""The velocity for the bounds of a joint without limit that teleports, rad/s (m/s)."""
 
 
 class WarpBackend(Backend):
@@ -134,7 +132,7 @@ class WarpBackend(Backend):
                     f"joint {robot.joint_names[int(unlimited.argmax())]} of {robot.name} has no velocity limit, which its servo "
                     "needs without dynamics: give max_joint_velocity"
                 )
-            self.joint_velocity = np.where(unlimited, _UNLIMITED, self.joint_velocity)
+            self.joint_velocity = stated_velocity(self.joint_velocity)
         self.randomisation = Randomisation({} if randomisation is None else randomisation, robot)
         self.random = bool(self.randomisation.ranges)
         if self.random and not self.dynamic:

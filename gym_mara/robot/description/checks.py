@@ -22,7 +22,7 @@ import numpy as np
 from gym_mara.errors import GymMaraError, short
 from gym_mara.files import plain_size
 from gym_mara.robot.description.joints import link_at
-from gym_mara.robot.description.meshes.files import LARGEST_MESHES, candidates
+from gym_mara.robot.description.meshes.files import LARGEST_MESHES, candidates, folder_findings
 from gym_mara.robot.diagnosis import Finding, Severity
 
 # More than any robot has; the number of pairs of shapes grows with the square.
@@ -151,7 +151,7 @@ def check_urdf(
         raise GymMaraError(
             f"the meshes of {str(urdf)!r} are larger than {LARGEST_MESHES:,} bytes together"
         )
-    return findings
+    return [*findings, *folder_findings(urdf, sorted(names), package_dirs)]
 
 
 class _BadPartError(Exception):

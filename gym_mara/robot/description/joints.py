@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,10 @@ import numpy as np
 
 from gym_mara.errors import GymMaraError
 from gym_mara.types import Floats
+
+ROUNDED = 1e-3
+"""A position this little beyond a limit is rounded, rad (m)."""
+_TURN = 2.0 * math.pi
 
 
 def limits_of(urdf: Path, joint: ElementTree.Element) -> tuple[float, float]:
@@ -26,6 +31,20 @@ def limits_of(urdf: Path, joint: ElementTree.Element) -> tuple[float, float]:
             f"{str(urdf)!r}: joint {joint.get('name')!r} has the lower limit {lower:g}, above its upper limit {upper:g}"
         )
     return lower, upper
+
+
+def within_limits(position: float, lower: float, upper: float, *, turns: bool) -> float:
+    """A position within a joint's limits, rad (m).
+
+    If a joint that `turns` is beyond them, the least number of whole turns that brings it within is added. Where none does, it is
+    put at the nearer limit.
+    """
+    if turns and not lower - ROUNDED <= position <= upper + ROUNDED:
+        fewest = math.ceil((lower - ROUNDED - position) / _TURN)
+        most = math.floor((upper + ROUNDED - position) / _TURN)
+        if fewest <= most:
+            position += _TURN * (fewest if position < lower else most)
+    return min(max(position, lower), upper)
 
 
 def axis_of(urdf: Path, joint: ElementTree.Element) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from gym_mara.errors import GymMaraError
-from gym_mara.robot.description.joints import axis_of, limits_of, vector
+from gym_mara.robot.description.joints import axis_of, limits_of, vector, within_limits
 from gym_mara.types import Floats
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -116,7 +116,7 @@ def _lock(urdf: Path, joint: ElementTree.Element, position: Sequence[float]) -> 
     limit = joint.find("limit")
     if limit is None or not {"lower", "upper"} & limit.attrib.keys():
         return at
-    return min(max(at, lower), upper)
+    return within_limits(at, lower, upper, turns=joint.get("type") == "revolute")
 
 
 def _fix(urdf: Path, joint: ElementTree.Element, position: float) -> None:

@@ -3,8 +3,9 @@
 from gym_mara.robot.diagnosis.bodies import body_findings
 from gym_mara.robot.diagnosis.collisions import collision_findings
 from gym_mara.robot.diagnosis.finding import Finding, Severity, raise_errors, warn
-from gym_mara.robot.diagnosis.joints import joint_findings, range_findings, written_limits
+from gym_mara.robot.diagnosis.joints import joint_findings
 from gym_mara.robot.diagnosis.semantics import semantics_findings
+from gym_mara.robot.diagnosis.written import range_findings, written_joints
 
 __all__ = [
     "Finding",
@@ -16,5 +17,5 @@ __all__ = [
     "range_findings",
     "semantics_findings",
     "warn",
-    "written_limits",
+    "written_joints",
 ]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from gym_mara.errors import LARGEST
-from gym_mara.robot.description.off_chain import Follower
-from gym_mara.robot.diagnosis.finding import Finding, listed, parts
+from gym_mara.errors import LARGEST, SMALLEST
+from gym_mara.robot.diagnosis.finding import Finding, Severity, listed, parts
 from gym_mara.robot.diagnosis.sampling import random_configurations
+from gym_mara.robot.joint_ranges import FARTHEST_TRAVEL, TRAVEL, unlimited
 from gym_mara.types import Mask
 
 if TYPE_CHECKING:
@@ -24,67 +23,12 @@ _POSES = 200
 """The number of random poses in which the motors must hold the arm."""
 _LIGHTEST = 0.05
 """A body with less mass and without shapes may be driven along unnoticed, kg."""
-_BEYOND = 1e-3
-"""A position this little beyond a limit is rounded, rad (m)."""
 
 
 def joint_findings(robot: RobotModel) -> list[Finding]:
     """The findings about the joints of a loaded arm."""
-    return [*_frozen(robot), *_limits(robot), *_too_weak(robot), *_driven_along(robot)]
-
-
-def written_limits(root: ElementTree.Element) -> dict[str, dict[str, float]]:
-    """The position limits "lower" and "upper" that a URDF writes, by joint; continuous joints need none."""
-    limited = (j for j in root.findall("joint") if j.get("type") in ("revolute", "prismatic"))
-    return {
-        joint.get("name", ""): {
-            end: float(limit.get(end, "0")) for end in ("lower", "upper") if end in limit.attrib
-        }
-        for joint in limited
-        for limit in joint.findall("limit")
-    }
-
-
-def range_findings(
-    written: Mapping[str, Mapping[str, float]],
-    chain: Sequence[str],
-    followers: Sequence[Follower],
-    model: pin.Model,
-) -> list[Finding]:
-    """The findings about position limits that are not in a loaded arm any more.
-
-    Args:
-        written: the limits of the URDF, see `written_limits`.
-        chain: the names of the joints of the chain.
-        followers: the joints that mimic one of it.
-        model: Pinocchio's model.
-    """
-    findings = []
-    for end, other in ("lower", "upper"), ("upper", "lower"):
-        if names := [n for n in chain if len(written.get(n, {})) == 1 and end not in written[n]]:
-            remedy = f'Add {end}="…" to <limit>'
-            message = f"<limit> has {other}=, but no {end}="
-            findings.append(
-                Finding("warning", parts("joint", names), message, "it counts as 0", remedy)
-            )
-    beyond = []
-    for follower in followers:
-        ends = model.lowerPositionLimit[follower.leader], model.upperPositionLimit[follower.leader]
-        low, high = sorted(follower.multiplier * end + follower.offset for end in ends)
-        own = written.get(follower.name, {})
-        if low < own.get("lower", low) - _BEYOND or high > own.get("upper", high) + _BEYOND:
-            beyond.append(follower.name)
-    if beyond:
-        findings.append(
-            Finding(
-                "note",
-                parts("joint", beyond),
-                "the range of the joint that it mimics moves it beyond its own limits",
-                "its own limits do not count",
-                "Correct <limit> or <mimic>, unless this is meant",
-            )
-        )
-    return findings
+    findings = _frozen(robot), _unlimited(robot), _limits(robot), _too_weak(robot)
+    return [finding for kind in (*findings, _driven_along(robot)) for finding in kind]
 
 
 def _named(robot: RobotModel, which: Mask) -> list[str]:
@@ -103,6 +47,27 @@ def _frozen(robot: RobotModel) -> Iterator[Finding]:
         )
 
 
+def _unlimited(robot: RobotModel) -> Iterator[Finding]:
+    """Position limits that mean none, or that are in degrees or mm."""
+    far, prismatic = unlimited(robot), robot.kinematics().prismatic
+    if names := _named(robot, far & ~prismatic):
+        yield Finding(
+            "warning",
+            parts("joint", names),
+            "the limits are beyond ±8π rad: are they in degrees, or does it turn without end?",
+            "actions and targets have one turn of it",
+            'Correct the limits, rad, or make the joint type="continuous"',
+        )
+    if names := _named(robot, far & prismatic):
+        yield Finding(
+            "warning",
+            parts("joint", names),
+            f"the limits are beyond ±{FARTHEST_TRAVEL:g} m",
+            f"actions and targets have {TRAVEL:g} m of it",
+            "Correct the limits, m",
+        )
+
+
 def _limits(robot: RobotModel) -> Iterator[Finding]:
     """Limits of effort and velocity that are zero or missing."""
     effects = {
@@ -116,7 +81,7 @@ def _limits(robot: RobotModel) -> Iterator[Finding]:
     for word, (unit, standing, endless) in effects.items():
         limits = getattr(robot, f"{word}_limit")
         for which, message, effect, verb in (
-            (limits <= 0.0, f"{word} limit 0", standing, "Correct"),
+            (limits < SMALLEST, f"{word} limit 0", standing, "Correct"),
             (limits >= LARGEST, f"no {word} limit", endless, "Add"),
         ):
             if names := _named(robot, which):
@@ -124,6 +89,19 @@ def _limits(robot: RobotModel) -> Iterator[Finding]:
                 yield Finding(
                     "error", parts("joint", names), message, effect, remedy, dynamics=True
                 )
+    unstated: tuple[tuple[Mask, Severity, str], ...] = (
+        (robot.velocity_limit < SMALLEST, "warning", "velocity limit 0"),
+        (robot.velocity_limit >= LARGEST, "note", "no velocity limit"),
+    )
+    for which, severity, message in unstated:
+        if names := _named(robot, which):
+            yield Finding(
+                severity,
+                parts("joint", names),
+                message,
+                "where joints jump to their targets it counts as 1 rad/s (m/s)",
+                "Correct <limit>, or give velocity_limit=… (rad/s)",
+            )
 
 
 def _too_weak(robot: RobotModel) -> Iterator[Finding]:

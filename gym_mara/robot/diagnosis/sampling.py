@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from gym_mara.robot.collision_pairs import Pair, keep_pairs, link_of, linked
 from gym_mara.robot.description.shapes import Mesh
+from gym_mara.robot.joint_ranges import useful_limits
 from gym_mara.types import Floats
 
 if TYPE_CHECKING:
@@ -27,17 +28,15 @@ ALWAYS = 0.95
 """The same for a link that does not move, such as a table, which an arm may well touch in most of its poses."""
 _STAGES = (16, 128)
 """Only pairs that touch in half of this share of the first 16 poses, then of the first 128, are tried in all."""
-_LONGEST_TRAVEL = 1e3
-"""Of a prismatic joint, m."""
 
 
 def random_configurations(robot: RobotModel, count: int) -> Floats:
     """Random configurations (N, J) within the limits of an arm, rad; fewer are the first of more."""
+    lower, upper = useful_limits(robot)
     # A joint of several turns is drawn from one of them.
-    span = 2.0 * np.where(robot.kinematics().prismatic, _LONGEST_TRAVEL, np.pi)
-    wide = robot.upper - robot.lower > span
-    low = np.where(wide, np.clip(-0.5 * span, robot.lower, robot.upper - span), robot.lower)
-    high = np.where(wide, low + span, robot.upper)
+    wide = ~robot.kinematics().prismatic & (upper - lower > 2.0 * np.pi)
+    low = np.where(wide, np.clip(-np.pi, lower, upper - 2.0 * np.pi), lower)
+    high = np.where(wide, low + 2.0 * np.pi, upper)
     return np.random.default_rng(0).uniform(low, high, (count, robot.num_joints))
 
 

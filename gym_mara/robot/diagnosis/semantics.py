@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gym_mara.robot.description.joints import ROUNDED
 from gym_mara.robot.description.srdf import Semantics
 from gym_mara.robot.diagnosis.finding import Finding, listed, parts
 
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
 
 _FEW = 5
 """An SRDF of which the URDF has less than a fifth describes another robot."""
-_BEYOND = 1e-3
-"""A position this little beyond a limit is rounded, rad (m)."""
+_TURN = 2.0 * np.pi
 
 
 def semantics_findings(
@@ -56,7 +56,19 @@ def _unknown_names(
 
 def _home(robot: RobotModel, semantics: Semantics) -> Iterator[Finding]:
     pose = semantics.home_pose(robot.joint_names)
-    beyond = np.abs(np.subtract(semantics.home(robot.joint_names), robot.home)) > _BEYOND
+    partial = [each for each in semantics.poses if each.values.keys() & set(robot.joint_names)]
+    if partial and not pose.values:
+        lacking = [joint for joint in robot.joint_names if joint not in partial[0].values]
+        yield Finding(
+            "note",
+            f"SRDF {str(robot.srdf)!r}",
+            f"no pose names every joint of the chain; {partial[0].name!r} lacks {listed(lacking)}",
+            "the start pose is zero, within the limits",
+            "Add the joints to a pose, or give start_q=[…]",
+        )
+    way = np.subtract(semantics.home(robot.joint_names), robot.home)
+    turned = np.where(robot.kinematics().prismatic, way, way - _TURN * np.round(way / _TURN))
+    beyond = np.abs(turned) > ROUNDED
     if pose.values and beyond.any():
         yield Finding(
             "warning",

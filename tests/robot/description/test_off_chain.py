@@ -103,6 +103,13 @@ def test_a_joint_off_the_chain_is_locked_within_its_limits_at_the_home_pose(
     np.testing.assert_allclose(_pose(robot, Q, "finger"), expected, atol=1e-14)
 
 
+def test_whole_turns_bring_a_locked_joint_within_its_limits(tmp_path: Path) -> None:
+    extra = _finger("revolute", LIMIT.format(-1.0, 1.0))
+    robot = _load(tmp_path, extra, HOME | {"jf": 6.0})
+    expected = _expected(upright_arm(extra), AT_Q | {"jf": 6.0}, "finger")
+    np.testing.assert_allclose(_pose(robot, Q, "finger"), expected, atol=1e-14)
+
+
 def test_at_zero_nothing_is_rounded(tmp_path: Path) -> None:
     extra = _finger("revolute", LIMIT.format(-1, 1))
     fixed = _load(tmp_path, _finger("fixed"))

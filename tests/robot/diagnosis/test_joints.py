@@ -34,7 +34,7 @@ def test_only_backends_with_dynamics_refuse_limits_that_are_zero_or_missing(
     tmp_path: Path, fault: str, backend: str
 ) -> None:
     text, message, remedy = FAULTS[fault]
-    robot = RobotModel.load(arm_file(tmp_path, text), TOOL)
+    robot = RobotModel.inspect(arm_file(tmp_path, text), TOOL)
     make_backend("pinocchio", robot, 1, {})
     with pytest.raises(GymMaraError, match=f"joints j1, j2, j3: {message}") as refused:
         make_backend(backend, robot, 1, {})
@@ -44,7 +44,7 @@ def test_only_backends_with_dynamics_refuse_limits_that_are_zero_or_missing(
 def test_limits_that_are_given_mend_them(tmp_path: Path) -> None:
     urdf = arm_file(tmp_path, FAULTS["no effort"][0])
     robot = RobotModel.load(urdf, TOOL, effort_limit=50, velocity_limit=2)
-    assert robot.findings == ()
+    assert [f.message for f in robot.findings] == ["continuous, without end stops"]
 
 
 @pytest.mark.parametrize(
@@ -58,6 +58,7 @@ def test_limits_that_are_given_mend_them(tmp_path: Path) -> None:
     ids=["velocity 0", "no velocity", "frozen", "frozen prismatic"],
 )
 @pytest.mark.filterwarnings("ignore:.*the lower limit equals the upper limit")
+@pytest.mark.filterwarnings("ignore:.*velocity limit 0")
 def test_the_spaces_of_such_arms_have_bounds_that_differ_and_are_sensible(
     tmp_path: Path, text: str
 ) -> None:
@@ -70,6 +71,41 @@ def test_the_spaces_of_such_arms_have_bounds_that_differ_and_are_sensible(
         assert (space.low < space.high).all()
         assert np.abs([space.low, space.high]).max() < 100.0
     env.close()
+
+
+@pytest.mark.parametrize("name", ["MARA-v0", "MARAReach-v0", "MARAPose-v0"])
+@pytest.mark.parametrize("speed", ["0", "1e-30"])
+def test_an_arm_of_velocity_0_moves_and_sees_finite_numbers_where_joints_jump(
+    tmp_path: Path, name: str, speed: str
+) -> None:
+    urdf = arm_file(
+        tmp_path, FAULTS["velocity 0"][0].replace('velocity="0"', f'velocity="{speed}"')
+    )
+    with pytest.warns(UserWarning, match="joints j1, j2, j3: velocity limit 0; .* 1 rad/s"):
+        env = gymnasium.make(f"gym_mara/{name}", robot=str(urdf), ee_frame=TOOL, action="relative")
+    backend = env.unwrapped.simulation.backend  # type: ignore[attr-defined]
+    observation, _ = env.reset(seed=0)
+    start = backend.state.q
+    for _ in range(3):
+        assert np.isfinite(observation).all()
+        assert observation in env.observation_space
+        observation, *_ = env.step(np.ones(3, np.float32))
+    moved = backend.state.q - start
+    assert (moved > 0.0).all()
+    assert (moved < 3.001 * 0.02).all(), "1 rad/s for three steps of 0.02 s"
+    env.close()
+
+
+def test_joints_that_travel_need_a_velocity_limit(tmp_path: Path) -> None:
+    robot = RobotModel.inspect(arm_file(tmp_path, FAULTS["velocity 0"][0]), TOOL)
+    with pytest.raises(GymMaraError, match=r"joint j1 .* velocity limit is 0: .* velocity_limit="):
+        make_backend("pinocchio", robot, 1, {"max_joint_velocity": 1.0})
+
+
+def test_no_velocity_limit_is_a_note_where_joints_jump(tmp_path: Path) -> None:
+    robot = RobotModel.inspect(arm_file(tmp_path, FAULTS["no velocity"][0]), TOOL)
+    (note,) = [f for f in robot.findings if f.message == "no velocity limit" and not f.dynamics]
+    assert (note.severity, note.part) == ("note", "joints j1, j2, j3")
 
 
 def test_an_arm_that_cannot_move_is_a_warning(tmp_path: Path) -> None:

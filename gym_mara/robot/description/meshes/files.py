@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from gym_mara.errors import GymMaraError
+from gym_mara.files import LARGEST_TEXT, read_bytes
+from gym_mara.robot.diagnosis import Finding
 
 _SHOWN = 6
 """The number of places that an error names."""
@@ -18,15 +21,21 @@ def mesh_file(urdf: Path, name: str, package_dirs: Sequence[str]) -> Path:
     """The file that a mesh's name means: an absolute path, file://…, package://… or a path beside the URDF.
 
     The package of package://PACKAGE/PATH is a folder of that name in `package_dirs`, in a folder above the URDF, or along
-    ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; or `package_dirs` has the folder itself.
+    ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; or `package_dirs` has the folder itself, called PACKAGE there or in its package.xml. A
+    folder of `package_dirs` with another name counts if the file is nowhere else.
 
     Raises:
-        GymMaraError: there is no such file.
+        GymMaraError: there is no such file, or only several in folders with other names.
     """
     places = candidates(urdf, name, package_dirs)
-    for place in places:
-        if os.path.lexists(place):
-            return place
+    if there := [place for place in places if os.path.lexists(place)]:
+        others = {os.path.realpath(place) for place in there}
+        if len(others) > 1 and there[0] in _in_other_folders(name, package_dirs):
+            raise GymMaraError(
+                f"the mesh {name!r} of {str(urdf)!r} is in no folder of its package's name, but in {len(others)} others: "
+                f"{', '.join(map(str, there[:_SHOWN]))}. Keep one in package_dirs, or rename the package's folder"
+            )
+        return there[0]
     shown = [str(place) for place in places[:_SHOWN]]
     rest = f" and {len(places) - _SHOWN} more places" if len(places) > _SHOWN else ""
     raise GymMaraError(
@@ -48,11 +57,55 @@ def candidates(urdf: Path, name: str, package_dirs: Sequence[str]) -> list[Path]
         for folder in os.environ.get(variable, "").split(os.pathsep)
         if folder
     ]
-    _, _, inside = rest.partition("/")
-    # package_dirs may name the package's own folder, whatever its name is.
-    renamed = [folder / inside for folder in given] if "://" in name else []
-    folders = [*given, own, *own.parents, *ros]
-    return list(dict.fromkeys([*(folder / rest for folder in folders), *renamed]))
+    if "://" not in name:
+        folders = [own, *given, *own.parents, *ros]
+        return list(dict.fromkeys(folder / rest for folder in folders))
+    package, _, inside = rest.partition("/")
+    places = [folder / rest for folder in given]
+    places += [folder / inside for folder in given if _is_package(folder, package)]
+    places += [folder / rest for folder in (own, *own.parents, *ros)]
+    return list(dict.fromkeys([*places, *_in_other_folders(name, package_dirs)]))
+
+
+def folder_findings(urdf: Path, names: Iterable[str], package_dirs: Sequence[str]) -> list[Finding]:
+    """The findings about packages of meshes of these names that are only in folders with other names."""
+    found = {}
+    for name in names:
+        places = candidates(urdf, name, package_dirs)
+        first = next((place for place in places if os.path.lexists(place)), None)
+        if first in _in_other_folders(name, package_dirs):
+            package, _, inside = name.rpartition("://")[2].partition("/")
+            found[package] = first.parents[len(Path(inside).parts) - 1]
+    return [
+        Finding(
+            "note",
+            f"package {package!r}",
+            f"its meshes are read from {str(folder)!r}, which has another name",
+            "they may be those of another package",
+            "Nothing is to do if they are right; else give package_dirs the package's folder",
+        )
+        for package, folder in found.items()
+    ]
+
+
+def _in_other_folders(name: str, package_dirs: Sequence[str]) -> list[Path]:
+    """The places of package://PACKAGE/PATH in folders of `package_dirs` that are not called PACKAGE."""
+    package, _, inside = name.rpartition("://")[2].partition("/")
+    if "://" not in name or _is_absolute(name) or not inside:
+        return []
+    folders = [Path(folder).absolute() for folder in package_dirs]
+    return [folder / inside for folder in folders if not _is_package(folder, package)]
+
+
+def _is_package(folder: Path, package: str) -> bool:
+    """Whether a folder is the package of this name, by its own name or by that in its package.xml."""
+    if folder.name == package:
+        return True
+    about = folder / "package.xml"
+    if not about.is_file():
+        return False
+    named = re.search(rb"<name>\s*([^<\s]+)\s*</name>", read_bytes(about, LARGEST_TEXT))
+    return named is not None and named[1].decode("utf-8", "replace") == package
 
 
 def _is_absolute(name: str) -> bool:
