@@ -110,6 +110,9 @@ class GoalSimulation(Simulation):
             reward = self._dense(achieved, desired, state.collided)
         return reward, terms | {"is_success": success}
 
+    def _goal_settings(self) -> dict[str, Any]:
+        return {"goal_environment": True, **vars(self._settings)}
+
     @property
     def reward_needs_info(self) -> bool:
         """Whether `compute_reward` reads the info of each step: only then does the reward depend on collisions."""
