@@ -163,7 +163,7 @@ class Simulation:
         self.actions.begin(q, mask)
         state.fill_actions(self.actions.action, self.actions.last_action)
         observation = self._observe(state, noise)
-        self._set_pace(observation)
+        self._set_pace(observation, mask)
         return observation, report(state)
 
     def _measured_start(self, noise: Floats, arms: Mask) -> Floats:
@@ -335,12 +335,18 @@ class Simulation:
             state = state.with_q(xp.minimum(xp.maximum(state.q, low), high))
         return self.observation(state, self.goal)
 
-    def _set_pace(self, observation: Floats) -> None:
-        """Note the pace of the next actions from the observations (N, O) to which they respond."""
-        if self._pace is not None:
-            self.actions.pace = namespace(observation).asarray(
-                observation[:, self._pace], copy=True
-            )
+    def _set_pace(self, observation: Floats, mask: Mask | None = None) -> None:
+        """Note the pace of the next actions from the observations (N, O) to which they respond.
+
+        With a mask (N,) the other arms respond to an earlier observation, and keep its pace.
+        """
+        if self._pace is None:
+            return
+        xp, pace = namespace(observation), observation[:, self._pace]
+        if mask is None:
+            self.actions.pace = xp.asarray(pace, copy=True)
+        else:
+            self.actions.pace = xp.where(mask[:, None], pace, self.actions.pace)
 
     def _check_open(self) -> None:
         if self._closed:
