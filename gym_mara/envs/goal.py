@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gym_mara import rotations
 from gym_mara.arrays import Constants, contiguous, namespace
 from gym_mara.envs.options import Options
+from gym_mara.envs.sensors import noise_of
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
@@ -99,6 +100,8 @@ class GoalSimulation(Simulation):
     def _reward(
         self, state: SimState, observation: Floats
     ) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        if noise_of(state) is not None:
+            observation = self._observe(state, None)  # the reward is of the true state
         _, terms = super()._reward(state, observation)
         achieved, desired = (
             observation[:, self._columns[name]] for name in ("achieved_goal", "desired_goal")
@@ -172,7 +175,8 @@ class _GoalEnv:
         """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
 
         Args:
-            achieved_goal: the poses of the end effector.
+            achieved_goal: the poses of the end effector; those of observations are measured if the sensors are noisy, and then
+                these rewards are not those of `step`.
             desired_goal: the target poses.
             info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
 
@@ -196,6 +200,7 @@ class MaraGoalEnv(_GoalEnv, MaraEnv):
     The observation is a dictionary. `observation` holds the joint positions (J,), rad, and the velocity of the end
     effector (3,), m/s. `achieved_goal` and `desired_goal` hold the positions (3,), m, of the end effector and of the
     target. If the task has `orientation`, their quaternions (4,), [w, x, y, z], follow. `info` also has `is_success`.
+    With noisy sensors `achieved_goal` is measured, while rewards and `is_success` of `step` are of the true pose.
 
     Args:
         task: the name of a reach task, or a ReachTask.

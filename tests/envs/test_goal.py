@@ -188,6 +188,37 @@ def test_a_collision_penalty_without_infos_is_an_error() -> None:
         env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
 
 
+@pytest.mark.parametrize("options", [{}, {"reward_type": "dense"}, {**ORIENT}])
+def test_the_reward_of_a_step_with_noisy_sensors_is_of_the_true_pose(
+    options: dict[str, Any],
+) -> None:
+    noise = {"sensor_noise": (0.05, 0.05)}
+    env = MaraGoalVectorEnv(4, backend="mujoco", randomisation=noise, **options)
+    env.reset(seed=0, options={"start_q": TARGET_Q, "target_position": _tool_at(TARGET_Q)})
+    away = 0.0
+    for _ in range(10):
+        observation: Any
+        observation, reward, _, _, info = env.step(np.tile(TARGET_Q, (4, 1)))
+        near = info["position_error"] <= 0.02
+        if "orientation" in options:
+            near &= info["angle_error"] <= 0.1
+        np.testing.assert_array_equal(info["is_success"], near)
+        if "reward_type" in options:
+            np.testing.assert_array_equal(reward, info["reward_distance"] - 1.0)
+        else:
+            np.testing.assert_array_equal(reward, near - 1.0)
+        measured = observation["achieved_goal"][:, :3] - observation["desired_goal"][:, :3]
+        away = max(away, float(np.linalg.norm(measured, axis=1).max()))
+        assert env.observation_space.contains(observation)
+    assert away > 0.02, "the sensors see some arm outside of the tolerance"
+    assert info["position_error"].max() < 0.02
+    env.close()
+
+
+def _tool_at(q: Any) -> Floats:
+    return robot_model("mara").kinematics().pose(np.array([q]))[0][0]
+
+
 # The vector environment.
 
 
