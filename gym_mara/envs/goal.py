@@ -12,7 +12,7 @@ from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 
 from gym_mara import rotations
-from gym_mara.arrays import Constants, contiguous, namespace
+from gym_mara.arrays import Constants, contiguous, host, namespace
 from gym_mara.envs.options import Options
 from gym_mara.envs.sensors import noise_of
 from gym_mara.envs.simulation import Simulation
@@ -123,20 +123,19 @@ class GoalSimulation(Simulation):
 
     def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
         """The rewards of goals, as in MaraGoalEnv."""
+        shape = _common_shape("goals", achieved.shape, desired.shape)
         if self._settings.reward_type == "sparse":
             return self._sparse(self._succeeds(achieved, desired), achieved)
-        rows = (-1, achieved.shape[-1])
-        collided: Mask = np.zeros(math.prod(achieved.shape[:-1]), np.bool_)
+        collided = np.zeros(shape[:-1], np.bool_)
         if self.reward_needs_info:
-            infos = [info] if isinstance(info, Mapping) else list(info)
-            if not all("collided" in one for one in infos):
-                raise GymMaraError(
-                    "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
-                )
-            collided = np.array([one["collided"] for one in infos])
-        collided = namespace(achieved).asarray(collided, device=achieved.device)
-        reward = self._dense(achieved.reshape(rows), desired.reshape(rows), collided)
-        return reward.reshape(achieved.shape[:-1])
+            collided = _collided(info, shape[:-1], "the collision penalty")
+        xp = namespace(achieved)
+        poses, goals = (
+            xp.broadcast_to(goal, shape).reshape(-1, shape[-1]) for goal in (achieved, desired)
+        )
+        collided = xp.asarray(collided.reshape(-1), device=achieved.device)
+        reward = self._dense(poses, goals, collided)
+        return reward.reshape(shape[:-1])
 
     def _sparse(self, success: Any, achieved: Floats) -> Any:
         """0 for the goals that are reached, -1 for the others, in the float type of the goals."""
@@ -166,22 +165,61 @@ class GoalSimulation(Simulation):
         return goal, xp.tile(no_turn, (len(goal), 1))
 
 
+def _common_shape(what: str, *shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape to which these broadcast.
+
+    Raises:
+        GymMaraError: they do not.
+    """
+    try:
+        return np.broadcast_shapes(*(tuple(shape) for shape in shapes))
+    except ValueError:
+        raise GymMaraError(
+            f"the {what} have the shapes {' and '.join(str(tuple(shape)) for shape in shapes)}: "
+            "give as many of each, or one for all"
+        ) from None
+
+
+def _collided(info: Any, shape: tuple[int, ...], reader: str) -> Mask:
+    """Which steps collided, for a batch of goals of a shape (…,), from one info, a vector environment's, or one for each goal.
+
+    Raises:
+        GymMaraError: `collided` is missing, or they are not as many as the goals.
+    """
+    one_for_all = isinstance(info, Mapping)
+    infos = [info] if one_for_all else np.array(info, dtype=object).reshape(-1)
+    if not all("collided" in one for one in infos):
+        raise GymMaraError(
+            f"{reader} needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
+        )
+    if one_for_all:
+        collided = host(info["collided"])
+    else:
+        collided = np.array([one["collided"] for one in infos], np.bool_)
+        if collided.size == math.prod(shape):
+            collided = collided.reshape(shape)
+    if _common_shape("goals and the infos", shape, collided.shape) != shape:
+        raise GymMaraError(f"{collided.size} infos are more than the goals, of shape {shape}")
+    return np.array(np.broadcast_to(collided, shape))  # torch takes no array that is read-only
+
+
 class _GoalEnv:
     """The methods of a goal environment in Gymnasium-Robotics."""
 
     simulation: Any
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
-        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G); one can stand for all of the others.
 
         Args:
             achieved_goal: the poses of the end effector; those of observations are measured if the sensors are noisy, and then
                 these rewards are not those of `step`.
             desired_goal: the target poses.
-            info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
+            info: the info of one step of this environment, or a sequence with one info per goal. The collision penalty reads
+                `collided`.
 
         Raises:
-            GymMaraError: the task has a collision penalty, and an info has no `collided`.
+            GymMaraError: the shapes do not fit; or the task has a collision penalty, and an info has no `collided`.
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 

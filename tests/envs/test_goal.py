@@ -286,6 +286,41 @@ def test_the_vector_environment_computes_rewards_for_other_goals() -> None:
     assert (success > reward).all()
 
 
+PENALISED: dict[str, Any] = {"reward_type": "dense", "collision_penalty": True}
+
+
+def test_the_vector_environment_computes_the_rewards_of_steps_with_collisions() -> None:
+    envs = MaraGoalVectorEnv(4, on_collision="continue", **PENALISED)
+    envs.reset(seed=0)
+    observation: Any
+    observation, reward, _, _, infos = envs.step(np.eye(4)[1][:, None] * COLLIDING_Q)
+    assert infos["collided"].tolist() == [False, True, False, False]
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    again = envs.compute_reward(*goals, infos)
+    np.testing.assert_allclose(again, reward, rtol=0.0, atol=1e-12)
+    one_each = [{"collided": one} for one in infos["collided"]]
+    np.testing.assert_array_equal(envs.compute_reward(*goals, one_each), again)
+    with pytest.raises(GymMaraError, match="the goals and the infos have the shapes"):
+        envs.compute_reward(*goals, one_each[:3])
+    with pytest.raises(GymMaraError, match="4 infos are more than the goals"):
+        envs.compute_reward(goals[0][0], goals[1][0], infos)
+
+
+@pytest.mark.parametrize("options", [{}, PENALISED])
+def test_rewards_are_computed_for_one_pose_and_many_goals(options: dict[str, Any]) -> None:
+    env: Any = MaraGoalEnv(**options)
+    env.reset(seed=0)
+    observation, _, _, _, info = env.step(np.zeros(6, np.float32))
+    pose = observation["achieved_goal"]
+    goals = pose + np.linspace(0.0, 0.1, 10).reshape(5, 2, 1)
+    rewards = env.compute_reward(pose, goals, info)
+    expected = [[env.compute_reward(pose, goal, info) for goal in row] for row in goals]
+    np.testing.assert_allclose(rewards, expected, rtol=0.0, atol=1e-12)
+    assert rewards[0, 0] > rewards[-1, -1]
+    with pytest.raises(GymMaraError, match="the goals have the shapes"):
+        env.compute_reward(np.zeros((2, 3)), np.zeros((3, 3)), info)
+
+
 def test_the_statistics_are_of_the_rewards_that_the_agent_receives() -> None:
     env: Any = MaraGoalEnv()
     env.reset(seed=0)
