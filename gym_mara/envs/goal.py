@@ -137,6 +137,21 @@ class GoalSimulation(Simulation):
         reward = self._dense(poses, goals, collided)
         return reward.reshape(shape[:-1])
 
+    def compute_terminated(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+        """Whether steps terminate the episode, as in MaraGoalEnv."""
+        if type(self.task).terminated is not Task.terminated:
+            raise GymMaraError(
+                f"compute_terminated knows goals, and {type(self.task).__name__} terminates episodes by their state: read "
+                "what step returns"
+            )
+        shape = _common_shape("goals", achieved.shape, desired.shape)[:-1]
+        terminated = np.zeros(shape, np.bool_)
+        if self.task.on_collision == "terminate":
+            terminated = _collided(info, shape, "on_collision='terminate'")
+        if not shape:
+            return bool(terminated)
+        return namespace(achieved).asarray(terminated, device=achieved.device)
+
     def _sparse(self, success: Any, achieved: Floats) -> Any:
         """0 for the goals that are reached, -1 for the others, in the float type of the goals."""
         _, one = _ONE.like(achieved)
@@ -190,7 +205,7 @@ def _collided(info: Any, shape: tuple[int, ...], reader: str) -> Mask:
     infos = [info] if one_for_all else np.array(info, dtype=object).reshape(-1)
     if not all("collided" in one for one in infos):
         raise GymMaraError(
-            f"{reader} needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
+            f"{reader} needs the info of each step, with 'collided': create HerReplayBuffer with copy_info_dict=True"
         )
     if one_for_all:
         collided = host(info["collided"])
@@ -223,12 +238,22 @@ class _GoalEnv:
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
-    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: an episode continues after the goal is reached."""
-        return False
+    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
+        """Whether steps terminate the episode: not by reaching the goal, but by a collision with `on_collision="terminate"`.
+
+        Args:
+            achieved_goal, desired_goal, info: as in `compute_reward`. With "terminate" the infos need `collided`.
+
+        Returns:
+            A bool, or an array of flags (...,) for batches of goals.
+
+        Raises:
+            GymMaraError: the shapes do not fit, an info has no `collided`, or the task terminates episodes itself.
+        """
+        return self.simulation.compute_terminated(achieved_goal, desired_goal, info)
 
     def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: a goal truncates no episode."""
+        """False: a goal truncates no episode. What `step` truncates because its state diverged is not known here."""
         return False
 
 

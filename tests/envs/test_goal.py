@@ -20,9 +20,9 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
 from gym_mara.state import SimState
-from gym_mara.tasks import Goal, Part, Task, Workspace, observation
+from gym_mara.tasks import Goal, Part, ReachTask, Task, Workspace, observation
 from gym_mara.testing import COLLIDING_Q, COPIES
-from gym_mara.types import Floats
+from gym_mara.types import Floats, Mask
 from tests.helpers import TARGET_Q, robot_model
 
 RANDOM = "MARARandomTarget-v0"
@@ -286,6 +286,29 @@ def test_the_vector_environment_computes_rewards_for_other_goals() -> None:
     assert (success > reward).all()
 
 
+@pytest.mark.parametrize("on_collision", ["terminate", "continue"])
+def test_compute_terminated_is_what_a_step_returned(on_collision: str) -> None:
+    env: Any = MaraGoalEnv(on_collision=on_collision)
+    envs: Any = MaraGoalVectorEnv(2, on_collision=on_collision)
+    env.reset(seed=0)
+    envs.reset(seed=0)
+    for q in (TARGET_Q, COLLIDING_Q):
+        observation, _, terminated, _, info = env.step(np.array(q, np.float32))
+        assert terminated == (on_collision == "terminate" and q is COLLIDING_Q)
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        assert env.compute_terminated(*goals, info) is terminated
+    observation, _, terminated, _, info = envs.step([TARGET_Q, COLLIDING_Q])
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    np.testing.assert_array_equal(envs.compute_terminated(*goals, info), terminated)
+
+
+def test_compute_terminated_of_a_task_that_terminates_itself_is_an_error() -> None:
+    env: Any = MaraGoalEnv(Arriving())
+    goal = env.reset(seed=0)[0]["desired_goal"]
+    with pytest.raises(GymMaraError, match="read what step returns"):
+        env.compute_terminated(goal, goal, {"collided": False})
+
+
 PENALISED: dict[str, Any] = {"reward_type": "dense", "collision_penalty": True}
 
 
@@ -325,6 +348,13 @@ def test_the_statistics_are_of_the_rewards_that_the_agent_receives() -> None:
     env: Any = MaraGoalEnv()
     env.reset(seed=0)
     assert env.step(np.zeros(6, np.float32))[4]["statistics"]["ep_rew_mean"] == -1.0
+
+
+class Arriving(ReachTask):
+    """Ends an episode at the target."""
+
+    def terminated(self, state: SimState, goal: Goal) -> Mask:
+        return np.linalg.norm(state.ee_position - goal.position, axis=-1) < 0.01
 
 
 class StillTask(Task):
