@@ -89,7 +89,9 @@ class PinocchioBackend(Backend):
         self._qd = np.zeros_like(self._q)
         self._time = np.zeros(num_envs)
         self._period = np.array(self.control_period)  # NumPy adds it faster than a Python number
-        self._collided: Mask | None = None
+        self._collided = np.zeros(num_envs, dtype=np.bool_)
+        # The arms that were put somewhere since the last check, which is made when it is asked for; None for none.
+        self._unchecked: Mask | None = np.ones(num_envs, dtype=np.bool_)
         self._touching = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(self, q: Floats, mask: Mask | None = None) -> None:
@@ -98,7 +100,9 @@ class PinocchioBackend(Backend):
         self._qd[rows] = 0.0
         self._time[rows] = 0.0
         self._touching[rows] = False
-        self._collided = None
+        if mask is None or self._unchecked is None:
+            self._unchecked = np.zeros(self.num_envs, np.bool_)
+        self._unchecked[rows] = True
 
     def step(self, q_target: Floats) -> SimState:
         if self.teleports:
@@ -106,6 +110,7 @@ class PinocchioBackend(Backend):
             self._collided = self._checker.check(self._q)
         else:
             self._travel(q_target)
+        self._unchecked = None
         self._time += self._period
         return self.state
 
@@ -165,8 +170,7 @@ class PinocchioBackend(Backend):
 
     @property
     def state(self) -> SimState:
-        if self._collided is None:
-            self._collided = self._checker.check(self._q)
+        self._check_where_reset()
         position, quaternion = self._kinematics.pose(self._q)
         if self.teleports:  # at rest
             velocity = np.zeros((self.num_envs, 3))
@@ -182,13 +186,23 @@ class PinocchioBackend(Backend):
             time=self._time.copy(),
         )
 
+    def _check_where_reset(self) -> None:
+        """Find out which of the arms that were put somewhere collide there."""
+        if self._unchecked is not None:
+            here = self._checker.check(self._q)  # of all arms, as CachedChecker needs
+            self._collided = np.where(self._unchecked, here, self._collided)
+            self._unchecked = None
+
     def save(self) -> dict[str, Any]:
+        self._check_where_reset()
         return {name: copy.copy(getattr(self, f"_{name}")) for name in _STATE}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
-        form: dict[str, Any] = {name: getattr(self, f"_{name}") for name in _STATE}
-        not_yet = snapshot.get("collided") is None  # collisions are found when they are asked for
-        form["collided"] = type(None) if not_yet else self._touching
-        check_fits("backend", snapshot, form)
+        # 0.2.0 saved None right after a reset, before it had checked the arms.
+        unchecked = snapshot.get("collided", False) is None
+        if unchecked:
+            snapshot = snapshot | {"collided": np.zeros_like(self._collided)}
+        check_fits("backend", snapshot, {name: getattr(self, f"_{name}") for name in _STATE})
         for name in _STATE:
             setattr(self, f"_{name}", copy.copy(snapshot[name]))
+        self._unchecked = np.ones_like(self._collided) if unchecked else None

@@ -87,10 +87,19 @@ def backend_settings(name: str) -> list[str]:
         BrokenBackendError: another package offers it, and it cannot be loaded.
         MissingExtraError: its engine is not installed.
     """
+    return list(backend_defaults(name))
+
+
+def backend_defaults(name: str) -> dict[str, Any]:
+    """The values of a backend's settings where none are given, by name.
+
+    Raises:
+        GymMaraError: as in `backend_settings`.
+    """
     backend = backend_class(name)
     parameters = inspect.signature(backend).parameters.values()
-    settings = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
-    return settings + ["workers"] * backend.in_processes
+    defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+    return defaults | ({"workers": None} if backend.in_processes else {})
 
 
 def installed_backends() -> tuple[list[str], list[str]]:

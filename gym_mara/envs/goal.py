@@ -12,8 +12,9 @@ from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 
 from gym_mara import rotations
-from gym_mara.arrays import Constants, contiguous, namespace
+from gym_mara.arrays import Constants, contiguous, host, namespace
 from gym_mara.envs.options import Options
+from gym_mara.envs.sensors import noise_of
 from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
@@ -99,6 +100,8 @@ class GoalSimulation(Simulation):
     def _reward(
         self, state: SimState, observation: Floats
     ) -> tuple[Floats, dict[str, NDArray[Any]]]:
+        if noise_of(state) is not None:
+            observation = self._observe(state, None)  # the reward is of the true state
         _, terms = super()._reward(state, observation)
         achieved, desired = (
             observation[:, self._columns[name]] for name in ("achieved_goal", "desired_goal")
@@ -110,6 +113,9 @@ class GoalSimulation(Simulation):
             reward = self._dense(achieved, desired, state.collided)
         return reward, terms | {"is_success": success}
 
+    def _goal_settings(self) -> dict[str, Any]:
+        return {"goal_environment": True, **vars(self._settings)}
+
     @property
     def reward_needs_info(self) -> bool:
         """Whether `compute_reward` reads the info of each step: only then does the reward depend on collisions."""
@@ -117,20 +123,34 @@ class GoalSimulation(Simulation):
 
     def compute_reward(self, achieved: Floats, desired: Floats, info: Any) -> Any:
         """The rewards of goals, as in MaraGoalEnv."""
+        shape = _common_shape("goals", achieved.shape, desired.shape)
         if self._settings.reward_type == "sparse":
             return self._sparse(self._succeeds(achieved, desired), achieved)
-        rows = (-1, achieved.shape[-1])
-        collided: Mask = np.zeros(math.prod(achieved.shape[:-1]), np.bool_)
+        collided = np.zeros(shape[:-1], np.bool_)
         if self.reward_needs_info:
-            infos = [info] if isinstance(info, Mapping) else list(info)
-            if not all("collided" in one for one in infos):
-                raise GymMaraError(
-                    "the collision penalty needs the info of each step: create HerReplayBuffer with copy_info_dict=True"
-                )
-            collided = np.array([one["collided"] for one in infos])
-        collided = namespace(achieved).asarray(collided, device=achieved.device)
-        reward = self._dense(achieved.reshape(rows), desired.reshape(rows), collided)
-        return reward.reshape(achieved.shape[:-1])
+            collided = _collided(info, shape[:-1], "the collision penalty")
+        xp = namespace(achieved)
+        poses, goals = (
+            xp.broadcast_to(goal, shape).reshape(-1, shape[-1]) for goal in (achieved, desired)
+        )
+        collided = xp.asarray(collided.reshape(-1), device=achieved.device)
+        reward = self._dense(poses, goals, collided)
+        return reward.reshape(shape[:-1])
+
+    def compute_terminated(self, achieved: Floats, desired: Floats, info: Any) -> Any:
+        """Whether steps terminate the episode, as in MaraGoalEnv."""
+        if type(self.task).terminated is not Task.terminated:
+            raise GymMaraError(
+                f"compute_terminated knows goals, and {type(self.task).__name__} terminates episodes by their state: read "
+                "what step returns"
+            )
+        shape = _common_shape("goals", achieved.shape, desired.shape)[:-1]
+        terminated = np.zeros(shape, np.bool_)
+        if self.task.on_collision == "terminate":
+            terminated = _collided(info, shape, "on_collision='terminate'")
+        if not shape:
+            return bool(terminated)
+        return namespace(achieved).asarray(terminated, device=achieved.device)
 
     def _sparse(self, success: Any, achieved: Floats) -> Any:
         """0 for the goals that are reached, -1 for the others, in the float type of the goals."""
@@ -160,30 +180,80 @@ class GoalSimulation(Simulation):
         return goal, xp.tile(no_turn, (len(goal), 1))
 
 
+def _common_shape(what: str, *shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape to which these broadcast.
+
+    Raises:
+        GymMaraError: they do not.
+    """
+    try:
+        return np.broadcast_shapes(*(tuple(shape) for shape in shapes))
+    except ValueError:
+        raise GymMaraError(
+            f"the {what} have the shapes {' and '.join(str(tuple(shape)) for shape in shapes)}: "
+            "give as many of each, or one for all"
+        ) from None
+
+
+def _collided(info: Any, shape: tuple[int, ...], reader: str) -> Mask:
+    """Which steps collided, for a batch of goals of a shape (…,), from one info, a vector environment's, or one for each goal.
+
+    Raises:
+        GymMaraError: `collided` is missing, or they are not as many as the goals.
+    """
+    one_for_all = isinstance(info, Mapping)
+    infos = [info] if one_for_all else np.array(info, dtype=object).reshape(-1)
+    if not all("collided" in one for one in infos):
+        raise GymMaraError(
+            f"{reader} needs the info of each step, with 'collided': create HerReplayBuffer with copy_info_dict=True"
+        )
+    if one_for_all:
+        collided = host(info["collided"])
+    else:
+        collided = np.array([one["collided"] for one in infos], np.bool_)
+        if collided.size == math.prod(shape):
+            collided = collided.reshape(shape)
+    if _common_shape("goals and the infos", shape, collided.shape) != shape:
+        raise GymMaraError(f"{collided.size} infos are more than the goals, of shape {shape}")
+    return np.array(np.broadcast_to(collided, shape))  # torch takes no array that is read-only
+
+
 class _GoalEnv:
     """The methods of a goal environment in Gymnasium-Robotics."""
 
     simulation: Any
 
     def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
-        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G).
+        """Compute the rewards (...,) of achieved goals (..., G) for desired goals (..., G); one can stand for all of the others.
 
         Args:
-            achieved_goal: the poses of the end effector.
+            achieved_goal: the poses of the end effector; those of observations are measured if the sensors are noisy, and then
+                these rewards are not those of `step`.
             desired_goal: the target poses.
-            info: the info of one step, or a sequence with one info per goal. The collision penalty reads `collided`.
+            info: the info of one step of this environment, or a sequence with one info per goal. The collision penalty reads
+                `collided`.
 
         Raises:
-            GymMaraError: the task has a collision penalty, and an info has no `collided`.
+            GymMaraError: the shapes do not fit; or the task has a collision penalty, and an info has no `collided`.
         """
         return self.simulation.compute_reward(achieved_goal, desired_goal, info)
 
-    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: an episode continues after the goal is reached."""
-        return False
+    def compute_terminated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> Any:
+        """Whether steps terminate the episode: not by reaching the goal, but by a collision with `on_collision="terminate"`.
+
+        Args:
+            achieved_goal, desired_goal, info: as in `compute_reward`. With "terminate" the infos need `collided`.
+
+        Returns:
+            A bool, or an array of flags (...,) for batches of goals.
+
+        Raises:
+            GymMaraError: the shapes do not fit, an info has no `collided`, or the task terminates episodes itself.
+        """
+        return self.simulation.compute_terminated(achieved_goal, desired_goal, info)
 
     def compute_truncated(self, achieved_goal: Floats, desired_goal: Floats, info: Any) -> bool:
-        """False: a goal truncates no episode."""
+        """False: a goal truncates no episode. What `step` truncates because its state diverged is not known here."""
         return False
 
 
@@ -193,6 +263,7 @@ class MaraGoalEnv(_GoalEnv, MaraEnv):
     The observation is a dictionary. `observation` holds the joint positions (J,), rad, and the velocity of the end
     effector (3,), m/s. `achieved_goal` and `desired_goal` hold the positions (3,), m, of the end effector and of the
     target. If the task has `orientation`, their quaternions (4,), [w, x, y, z], follow. `info` also has `is_success`.
+    With noisy sensors `achieved_goal` is measured, while rewards and `is_success` of `step` are of the true pose.
 
     Args:
         task: the name of a reach task, or a ReachTask.

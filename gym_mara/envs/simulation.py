@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gym_mara.arrays import host, namespace, zeros_like
 from gym_mara.backends import backend_settings, make_backend
+from gym_mara.backends.registry import backend_defaults
 from gym_mara.envs.actions import Actions, make_actions
 from gym_mara.envs.episodes import Episodes
 from gym_mara.envs.given import Given
@@ -23,7 +25,8 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.envs.streams import Streams, check_streams, parameter_seeds
 from gym_mara.errors import GymMaraError, whole_number
 from gym_mara.rendering.settings import STATE
-from gym_mara.snapshots import check_fits
+from gym_mara.robot.fingerprint import fingerprint
+from gym_mara.snapshots import check_fits, check_same_arguments, plain
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation
 from gym_mara.tasks.observation import PACE, last_action
@@ -31,6 +34,9 @@ from gym_mara.types import Floats, Mask
 
 if TYPE_CHECKING:
     from gym_mara.envs.pictured import Pictured
+
+_ONLY_SPEED = {"workers", "threads", "collision_threads", "arrays", "device"}
+"""Settings of backends that change how fast the numbers are computed, and at most their rounding."""
 
 
 class Simulation:
@@ -69,6 +75,7 @@ class Simulation:
         self._tensor = None if self.backend.arrays == "numpy" else self.episodes.start
         self._started = False
         self._closed = False
+        self._arguments: dict[str, Any] | None = None
         self.outcome: Outcome | None = None
         """The outcome of the last step."""
         # The arms that began an episode after the last step.
@@ -156,7 +163,7 @@ class Simulation:
         self.actions.begin(q, mask)
         state.fill_actions(self.actions.action, self.actions.last_action)
         observation = self._observe(state, noise)
-        self._set_pace(observation)
+        self._set_pace(observation, mask)
         return observation, report(state)
 
     def _measured_start(self, noise: Floats, arms: Mask) -> Floats:
@@ -291,6 +298,7 @@ class Simulation:
         backend.reset(q)
         self.backend.close()
         self.backend, self.backend_name, self.outcome = backend, name, None
+        self._arguments = None
         self._sensors = self._new_sensors()
         noise = noise_of(backend.state)
         if noise is not None:
@@ -327,12 +335,18 @@ class Simulation:
             state = state.with_q(xp.minimum(xp.maximum(state.q, low), high))
         return self.observation(state, self.goal)
 
-    def _set_pace(self, observation: Floats) -> None:
-        """Note the pace of the next actions from the observations (N, O) to which they respond."""
-        if self._pace is not None:
-            self.actions.pace = namespace(observation).asarray(
-                observation[:, self._pace], copy=True
-            )
+    def _set_pace(self, observation: Floats, mask: Mask | None = None) -> None:
+        """Note the pace of the next actions from the observations (N, O) to which they respond.
+
+        With a mask (N,) the other arms respond to an earlier observation, and keep its pace.
+        """
+        if self._pace is None:
+            return
+        xp, pace = namespace(observation), observation[:, self._pace]
+        if mask is None:
+            self.actions.pace = xp.asarray(pace, copy=True)
+        else:
+            self.actions.pace = xp.where(mask[:, None], pace, self.actions.pace)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -341,7 +355,7 @@ class Simulation:
     def save(self) -> dict[str, Any]:
         """A snapshot of the arms, the sensors, the last actions, the random generators, the goals and the statistics."""
         return {
-            "made_with": self._made_with(),
+            "made_with": dict(self._made_with()),
             "backend": self.backend.save(),
             "statistics": self.statistics.copy(),
             "sensors": self._sensors.save(),
@@ -365,13 +379,9 @@ class Simulation:
         """
         self._check_open()
         made_with = snapshot.get("made_with") if isinstance(snapshot, dict) else None
-        if made_with != self._made_with():
-            raise GymMaraError(
-                f"the snapshot is of (robot, backend, arms, action) {made_with}, and this environment is {self._made_with()}: "
-                "restore only what an environment with the same arguments has saved"
-            )
+        check_same_arguments(made_with, self._made_with())
         form = {
-            "made_with": tuple,
+            "made_with": type(made_with),
             "backend": dict,
             "statistics": EpisodeStatistics,
             "sensors": dict,
@@ -387,8 +397,31 @@ class Simulation:
         self._sensors.check(snapshot["sensors"])
         check_streams(snapshot["streams"], self.num_envs)
 
-    def _made_with(self) -> tuple[str, str, int, str]:
-        return self.robot.name, self.backend_name, self.num_envs, self.actions.mode
+    def _made_with(self) -> dict[str, Any]:
+        """The arguments on which the numbers depend, and their defaults, as plain values; not those of pictures."""
+        if self._arguments is None:
+            defaults = backend_defaults(self.backend_name)
+            given = self.options.settings
+            settings = {name: given.get(name, value) for name, value in defaults.items()}
+            parts = self.options.actions, self.options.sensors, self.task
+            self._arguments = plain(
+                {
+                    **{f.name: getattr(p, f.name) for p in parts for f in dataclasses.fields(p)},
+                    **{name: settings[name] for name in settings.keys() - _ONLY_SPEED},
+                    "task": type(self.task).__qualname__,
+                    "robot": self.robot.name,
+                    "robot_fingerprint": fingerprint(self.robot),
+                    "backend": self.backend_name,
+                    "num_envs": self.num_envs,
+                    "action": self.actions.mode,
+                    **self._goal_settings(),
+                }
+            )
+        return self._arguments
+
+    def _goal_settings(self) -> dict[str, Any]:
+        """The keyword arguments of a goal environment, and whether it is one."""
+        return {"goal_environment": False}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Restore a snapshot that `check_snapshot` has checked.

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
@@ -108,12 +109,17 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
         Raises:
             GymMaraError: the seeds, the mask or another option are not valid, as in MaraEnv. Nothing has changed then.
+            ResetNeeded: the mask of the first reset leaves out arms, which would never have begun an episode.
         """
         check_reset_options(options, ["reset_mask", *GIVEN])
         seeds = self._seeds(seed)
         mask = (options or {}).get("reset_mask")
         if mask is not None:
             mask = self._checked(mask)
+            if self._last is None and not bool(mask.all()):
+                raise ResetNeeded(
+                    "call reset() for all arms before you reset some of them by a mask"
+                )
         given = self.simulation.episodes.given(options, mask)
         super().reset(seed=seeds[0])
         xp = namespace(self._ended)

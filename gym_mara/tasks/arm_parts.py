@@ -34,7 +34,7 @@ _FAR_STEP = 0.3
 _LEVER = 0.01
 """With levers of this length, m, a joint's way to the target counts a quarter; it is undefined with none."""
 _CLOSE, _OVERLAP = 0.03, 0.1
-"""The scale of a small clearance, and the largest overlap of spheres, m."""
+"""The scale of a small clearance, and the largest overlap of spheres that counts, m."""
 _PUSH, _STRONG = 0.05, 1.0
 """The scales of the direction and of the strength of a repulsion, m/rad."""
 _SMALL = 1e-9
@@ -73,6 +73,7 @@ class ArmParts:
         self._limits = Constants(robot.lower + _AT_LIMIT, robot.upper - _AT_LIMIT)
         self._pace = Constants(length_per_angle, slow_within, 1.0)
         self._scales = Constants(_SCALES, _ANGLE_SCALES, _JOINT_SCALES, _FAR_STEP)
+        self._overlap = Constants(-1.0, 0.0)
         self._seen: tuple[Any, ...] = (None, None)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -191,11 +192,13 @@ class ArmParts:
     def clearance(self, state: SimState, goal: Goal) -> Floats:
         """The least distance d of each body from those that it may touch, by `gym_mara.robot.clearance` (N, 2 J).
 
-        As d / FAR, and e^(-(d + 0.1)/0.03).
+        As d / FAR from -1 on, and e^(-(d + 0.1)/0.03) up to 1, which only spheres of thick links go beyond.
         """
         least, _ = self._nearness(state, goal)
-        xp = self._constants.like(least)[0]
-        return xp.concat([least / FAR, xp.exp(-(least + _OVERLAP) / _CLOSE)], axis=-1)
+        xp, lowest, highest = self._overlap.like(least)
+        far = xp.maximum(least / FAR, lowest)
+        close = xp.exp(xp.minimum(-(least + _OVERLAP) / _CLOSE, highest))
+        return xp.concat([far, close], axis=-1)
 
     def joint_repulsions(self, state: SimState, goal: Goal) -> Floats:
         """Which way each joint leads away from collisions, and how strongly (N, 2 J), from -1 to 1.

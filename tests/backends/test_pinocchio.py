@@ -233,6 +233,16 @@ def _count_checks(backend: PinocchioBackend) -> list[int]:
     return counts
 
 
+def test_a_snapshot_without_collisions_is_restored() -> None:
+    # 0.2.0 saved none right after a reset; checkpoints of its runs have them.
+    backend = PinocchioBackend(robot_model("mara"), 2)
+    backend.reset(np.array([COLLIDING_Q, np.zeros(6)]))
+    snapshot = backend.save() | {"collided": None}
+    backend.step(np.zeros((2, 6)))
+    backend.restore(snapshot)
+    assert backend.state.collided.tolist() == [True, False]
+
+
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 def test_other_robots_travel_too(name: str) -> None:
     robot: RobotModel = robot_model(name)

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from gym_mara.collision import make_checker
 from gym_mara.envs import MaraEnv, MaraVectorEnv
 from gym_mara.robot import RobotModel
-from gym_mara.testing import pickled
+from gym_mara.testing import COLLIDING_Q, pickled
 from gym_mara.types import Floats
 
 TASKS = ("MARAReach-v0", "MARAPose-v0")
@@ -104,6 +104,40 @@ def test_near_the_target_a_step_is_a_part_of_a_step() -> None:
                 -0.5 * pace * env.simulation.actions.steps, env.simulation.robot.lower - q
             )
             np.testing.assert_allclose(moved, expected, atol=1e-9)
+
+
+def test_the_pace_of_an_arm_that_collided_does_not_depend_on_resets_of_others() -> None:
+    one, two = (
+        MaraVectorEnv(
+            count,
+            "MARAReach-v0",
+            autoreset_mode="Disabled",
+            on_collision="reset",
+            slow_within=1.0,
+            start_q=np.zeros(6),
+            max_joint_velocity=1.57,
+        )
+        for count in (1, 2)
+    )
+    one.reset(seed=3)
+    two.reset(seed=3)
+    alone = one.simulation
+    for _ in range(200):
+        way = COLLIDING_Q - alone.backend.state.q
+        action = np.clip(way / alone.actions.steps, -1.0, 1.0)
+        info = one.step(action)[4]
+        observation = two.step(np.vstack([action, np.zeros((1, 6))]))[0]
+        if info["collided"][0]:
+            break
+    assert not alone.backend.state.q.any(), "the collision has put the arm back"
+    two.reset(options={"reset_mask": np.array([False, True])})
+    pace = alone.observation.split(observation[:1])["pace"]
+    for envs in (one, two):
+        np.testing.assert_allclose(envs.simulation.actions.pace[:1], pace, rtol=0.0, atol=1e-12)
+    expected, reward, *_ = one.step(-np.ones((1, 6)))
+    mine, rewards, *_ = two.step(-np.ones((2, 6)))
+    np.testing.assert_allclose(mine[:1], expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(rewards[:1], reward, rtol=0.0, atol=1e-12)
 
 
 def test_the_guide_leads_to_the_target_and_follows_it() -> None:

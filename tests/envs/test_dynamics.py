@@ -177,16 +177,6 @@ def test_sensor_noise_changes_the_observation_but_not_the_reward(backend: str) -
     np.testing.assert_allclose(np.std(measured, axis=0), 0.01, rtol=0.25)
 
 
-def test_arms_without_a_first_episode_do_not_affect_the_others(
-    in_one_process: dict[str, Any],
-) -> None:
-    envs = MaraVectorEnv(2, **in_one_process, randomisation={"sensor_noise": (0.01, 0.01)})
-    envs.reset(seed=0, options={"reset_mask": np.array([True, False])})
-    observation, *_ = envs.step(np.zeros((2, 6)))
-    assert (observation[0, :6] != 0.0).any()
-    assert np.abs(observation[1, :6]).max() < 1e-6
-
-
 @pytest.mark.parametrize("duplicate", COPIES)
 def test_a_copy_in_mid_episode_continues_identically(
     backend: str,

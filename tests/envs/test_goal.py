@@ -20,9 +20,9 @@ from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.robot.inverse_kinematics import miss
 from gym_mara.state import SimState
-from gym_mara.tasks import Goal, Part, Task, Workspace, observation
+from gym_mara.tasks import Goal, Part, ReachTask, Task, Workspace, observation
 from gym_mara.testing import COLLIDING_Q, COPIES
-from gym_mara.types import Floats
+from gym_mara.types import Floats, Mask
 from tests.helpers import TARGET_Q, robot_model
 
 RANDOM = "MARARandomTarget-v0"
@@ -188,6 +188,37 @@ def test_a_collision_penalty_without_infos_is_an_error() -> None:
         env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
 
 
+@pytest.mark.parametrize("options", [{}, {"reward_type": "dense"}, {**ORIENT}])
+def test_the_reward_of_a_step_with_noisy_sensors_is_of_the_true_pose(
+    options: dict[str, Any],
+) -> None:
+    noise = {"sensor_noise": (0.05, 0.05)}
+    env = MaraGoalVectorEnv(4, backend="mujoco", randomisation=noise, **options)
+    env.reset(seed=0, options={"start_q": TARGET_Q, "target_position": _tool_at(TARGET_Q)})
+    away = 0.0
+    for _ in range(10):
+        observation: Any
+        observation, reward, _, _, info = env.step(np.tile(TARGET_Q, (4, 1)))
+        near = info["position_error"] <= 0.02
+        if "orientation" in options:
+            near &= info["angle_error"] <= 0.1
+        np.testing.assert_array_equal(info["is_success"], near)
+        if "reward_type" in options:
+            np.testing.assert_array_equal(reward, info["reward_distance"] - 1.0)
+        else:
+            np.testing.assert_array_equal(reward, near - 1.0)
+        measured = observation["achieved_goal"][:, :3] - observation["desired_goal"][:, :3]
+        away = max(away, float(np.linalg.norm(measured, axis=1).max()))
+        assert env.observation_space.contains(observation)
+    assert away > 0.02, "the sensors see some arm outside of the tolerance"
+    assert info["position_error"].max() < 0.02
+    env.close()
+
+
+def _tool_at(q: Any) -> Floats:
+    return robot_model("mara").kinematics().pose(np.array([q]))[0][0]
+
+
 # The vector environment.
 
 
@@ -255,10 +286,75 @@ def test_the_vector_environment_computes_rewards_for_other_goals() -> None:
     assert (success > reward).all()
 
 
+@pytest.mark.parametrize("on_collision", ["terminate", "continue"])
+def test_compute_terminated_is_what_a_step_returned(on_collision: str) -> None:
+    env: Any = MaraGoalEnv(on_collision=on_collision)
+    envs: Any = MaraGoalVectorEnv(2, on_collision=on_collision)
+    env.reset(seed=0)
+    envs.reset(seed=0)
+    for q in (TARGET_Q, COLLIDING_Q):
+        observation, _, terminated, _, info = env.step(np.array(q, np.float32))
+        assert terminated == (on_collision == "terminate" and q is COLLIDING_Q)
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        assert env.compute_terminated(*goals, info) is terminated
+    observation, _, terminated, _, info = envs.step([TARGET_Q, COLLIDING_Q])
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    np.testing.assert_array_equal(envs.compute_terminated(*goals, info), terminated)
+
+
+def test_compute_terminated_of_a_task_that_terminates_itself_is_an_error() -> None:
+    env: Any = MaraGoalEnv(Arriving())
+    goal = env.reset(seed=0)[0]["desired_goal"]
+    with pytest.raises(GymMaraError, match="read what step returns"):
+        env.compute_terminated(goal, goal, {"collided": False})
+
+
+PENALISED: dict[str, Any] = {"reward_type": "dense", "collision_penalty": True}
+
+
+def test_the_vector_environment_computes_the_rewards_of_steps_with_collisions() -> None:
+    envs = MaraGoalVectorEnv(4, on_collision="continue", **PENALISED)
+    envs.reset(seed=0)
+    observation: Any
+    observation, reward, _, _, infos = envs.step(np.eye(4)[1][:, None] * COLLIDING_Q)
+    assert infos["collided"].tolist() == [False, True, False, False]
+    goals = observation["achieved_goal"], observation["desired_goal"]
+    again = envs.compute_reward(*goals, infos)
+    np.testing.assert_allclose(again, reward, rtol=0.0, atol=1e-12)
+    one_each = [{"collided": one} for one in infos["collided"]]
+    np.testing.assert_array_equal(envs.compute_reward(*goals, one_each), again)
+    with pytest.raises(GymMaraError, match="the goals and the infos have the shapes"):
+        envs.compute_reward(*goals, one_each[:3])
+    with pytest.raises(GymMaraError, match="4 infos are more than the goals"):
+        envs.compute_reward(goals[0][0], goals[1][0], infos)
+
+
+@pytest.mark.parametrize("options", [{}, PENALISED])
+def test_rewards_are_computed_for_one_pose_and_many_goals(options: dict[str, Any]) -> None:
+    env: Any = MaraGoalEnv(**options)
+    env.reset(seed=0)
+    observation, _, _, _, info = env.step(np.zeros(6, np.float32))
+    pose = observation["achieved_goal"]
+    goals = pose + np.linspace(0.0, 0.1, 10).reshape(5, 2, 1)
+    rewards = env.compute_reward(pose, goals, info)
+    expected = [[env.compute_reward(pose, goal, info) for goal in row] for row in goals]
+    np.testing.assert_allclose(rewards, expected, rtol=0.0, atol=1e-12)
+    assert rewards[0, 0] > rewards[-1, -1]
+    with pytest.raises(GymMaraError, match="the goals have the shapes"):
+        env.compute_reward(np.zeros((2, 3)), np.zeros((3, 3)), info)
+
+
 def test_the_statistics_are_of_the_rewards_that_the_agent_receives() -> None:
     env: Any = MaraGoalEnv()
     env.reset(seed=0)
     assert env.step(np.zeros(6, np.float32))[4]["statistics"]["ep_rew_mean"] == -1.0
+
+
+class Arriving(ReachTask):
+    """Ends an episode at the target."""
+
+    def terminated(self, state: SimState, goal: Goal) -> Mask:
+        return np.linalg.norm(state.ee_position - goal.position, axis=-1) < 0.01
 
 
 class StillTask(Task):

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import gym_mara.compat.gym_gazebo2  # noqa: F401 - registers its ids
 from gym_mara.envs import MaraEnv, MaraVectorEnv
+from gym_mara.envs.goal import MaraGoalEnv
 from gym_mara.errors import GymMaraError
 from gym_mara.testing import COPIES, pickled
 
@@ -189,15 +190,17 @@ def test_the_episode_size_of_gym_gazebo2_is_restored() -> None:
 
 
 OTHERS: dict[str, Callable[[], Any]] = {
-    "another robot": lambda: _saved(MaraEnv(robot="ur5")),
-    "another backend": lambda: _saved(MaraEnv(backend="dart")),
-    "a batch": lambda: _saved(MaraVectorEnv(1)),
-    "a part is missing": lambda: {k: v for k, v in _saved(MaraEnv()).items() if k != "streams"},
+    "another robot": lambda: _saved(MaraEnv(RANDOM, robot="ur5")),
+    "another backend": lambda: _saved(MaraEnv(RANDOM, backend="dart")),
+    "a batch": lambda: _saved(MaraVectorEnv(1, RANDOM)),
+    "a part is missing": lambda: {k: v for k, v in _saved(MaraEnv(RANDOM)).items() if k != "goal"},
     "NaN": lambda: _with_backend(q=np.full((1, 6), np.nan)),
     "no arrays": lambda: _with_backend(q=None),
-    "generators": lambda: _saved(MaraEnv()) | {"np_random": 3},
+    "generators": lambda: _saved(MaraEnv(RANDOM)) | {"np_random": 3},
+    "no arguments": lambda: _saved(MaraEnv(RANDOM)) | {"made_with": ("mara",)},
     "nothing": lambda: None,
 }
+RANDOM = "MARARandomTarget-v0"
 
 
 def _saved(env: Any) -> Any:
@@ -208,7 +211,7 @@ def _saved(env: Any) -> Any:
 
 
 def _with_backend(**changes: Any) -> dict[str, Any]:
-    snapshot = _saved(MaraEnv())
+    snapshot = _saved(MaraEnv(RANDOM))
     return snapshot | {"backend": snapshot["backend"] | changes}  # type: ignore[no-any-return]
 
 
@@ -217,7 +220,7 @@ def test_a_snapshot_of_another_environment_is_refused_and_changes_nothing(
     make: Callable[[], Any],
 ) -> None:
     snapshot = make()
-    env, same = MaraEnv("MARARandomTarget-v0"), MaraEnv("MARARandomTarget-v0")
+    env, same = MaraEnv(RANDOM), MaraEnv(RANDOM)
     for each in (env, same):
         each.reset(seed=1)
     with pytest.raises(GymMaraError, match="snapshot"):
@@ -230,6 +233,52 @@ def test_a_snapshot_of_another_environment_is_refused_and_changes_nothing(
 def test_a_snapshot_of_another_batch_is_refused(backend: str) -> None:
     env = MaraVectorEnv(2, backend=backend)
     env.reset(seed=1)
-    with pytest.raises(GymMaraError, match="arms"):
+    with pytest.raises(GymMaraError, match="num_envs 3"):
         env.restore_state(_saved(MaraVectorEnv(3, backend=backend)))
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("make", "differs"),
+    [
+        (lambda: _saved(MaraEnv(RANDOM)), "task 'RandomReachTask'"),
+        (lambda: _saved(MaraGoalEnv("MARA-v0")), "goal_environment True"),
+        (lambda: _saved(MaraEnv(target_position=[-0.3, 0.3, 0.8])), "target_position"),
+        (lambda: _saved(MaraEnv("MARACollisionOrient-v0")), "collision_penalty True"),
+        (lambda: _saved(MaraEnv(control_period=0.05)), r"control_period 0.05 \(here 0.02\)"),
+        (lambda: _saved(MaraEnv(max_joint_velocity=0.3)), "max_joint_velocity 0.3"),
+        (lambda: _saved(MaraEnv(velocity_limit=0.3)), "robot_fingerprint"),
+    ],
+)
+def test_a_snapshot_of_an_environment_with_other_arguments_is_refused(
+    make: Callable[[], Any], differs: str
+) -> None:
+    env, same = MaraEnv(), MaraEnv()
+    for each in (env, same):
+        each.reset(seed=1)
+    with pytest.raises(GymMaraError, match=f"the snapshot is of an environment with .*{differs}"):
+        env.restore_state(make())
+    assert repr(env.reset()) == repr(same.reset())
+
+
+def test_goal_environments_with_other_tolerances_do_not_share_snapshots() -> None:
+    env = MaraGoalEnv()
+    env.reset(seed=1)
+    with pytest.raises(GymMaraError, match=r"position_tolerance 0.05 \(here 0.02\)"):
+        env.restore_state(_saved(MaraGoalEnv(position_tolerance=0.05)))
+
+
+def test_snapshots_are_shared_by_equal_arguments_in_other_words_and_by_other_threads() -> None:
+    start = np.full(6, 0.1)
+    snapshot = _saved(MaraEnv(start_q=start, control_period=0.02, collision_threads=2))
+    env = MaraEnv(start_q=tuple(start.tolist()))
+    env.restore_state(pickled(snapshot))
+    np.testing.assert_allclose(env.simulation.backend.state.q[0], start)
+
+
+def test_a_snapshot_of_the_first_form_is_restored() -> None:
+    # 0.2.0 stored four arguments; checkpoints of its runs have them.
+    env = MaraEnv()
+    env.restore_state(_saved(MaraEnv()) | {"made_with": ("mara", "pinocchio", 1, "absolute")})
+    with pytest.raises(GymMaraError, match="robot 'ur5'"):
+        env.restore_state(_saved(MaraEnv()) | {"made_with": ("ur5", "pinocchio", 1, "absolute")})

@@ -178,12 +178,13 @@ def test_goal_environments_give_the_numbers_of_numpy(
     pair: Make, mode: str, reward_type: str, dtype: str
 ) -> None:
     options: dict[str, Any] = {"reward_type": reward_type, "position_tolerance": 0.5}
+    options["collision_penalty"] = reward_type == "dense"
     tensors, arrays = pair("MARARandomTarget-v0", dtype, autoreset_mode=mode, **options)
     _assert_same_runs(tensors, arrays, 60, dtype)
-    poses = tensors.step(next(_actions(1)))[0]
+    poses, *_, info = tensors.step(next(_actions(1)))
     goals = [poses[name] for name in ("achieved_goal", "desired_goal")]
-    again = tensors.compute_reward(*goals, {})
-    expected = arrays.compute_reward(*map(host, goals), {})
+    again = tensors.compute_reward(*goals, info)
+    expected = arrays.compute_reward(*map(host, goals), {"collided": host(info["collided"])})
     np.testing.assert_allclose(host(again), expected, rtol=0.0, atol=TOLERANCE[dtype])
 
 

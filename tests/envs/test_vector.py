@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -457,6 +458,18 @@ def test_a_dropped_environment_ends_its_worker_processes(name: str) -> None:
     del envs
     gc.collect()
     assert not any(process.is_alive() for process in processes)
+
+
+@pytest.mark.parametrize("task", ["MARA-v0", "MARAReach-v0"])
+def test_the_first_reset_is_of_all_arms(task: str) -> None:
+    env, same = MaraVectorEnv(3, task), MaraVectorEnv(3, task)
+    everyone = np.ones(3, np.bool_)
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) for all arms"):
+        env.reset(seed=7, options={"reset_mask": everyone & [True, False, False]})
+    with pytest.raises(ResetNeeded, match="before the first step"):
+        env.step(np.zeros((3, 6)))
+    mine, theirs = (each.reset(seed=0, options={"reset_mask": everyone})[0] for each in (env, same))
+    np.testing.assert_array_equal(mine, theirs)
 
 
 @pytest.mark.parametrize("seed", [-1, 5.0, "ab", b"ab", [0, -1], [0, "a"], [1.5, 2], {1: 2, 3: 4}])

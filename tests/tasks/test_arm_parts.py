@@ -39,13 +39,30 @@ SLIDER = """
 </robot>
 """
 
+# Links of 0.7 m, whose spheres overlap by more than those of thin arms can.
+THICK = """
+<robot name="thick">
+  <link name="base"><collision><geometry><box size="3 3 0.1"/></geometry></collision></link>
+  <joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.8"/><axis xyz="0 1 0"/>
+    <limit lower="-2.2" upper="2.2" effort="20" velocity="1.5"/></joint>
+  <link name="upper"><collision><origin xyz="0 0 0.9"/><geometry><box size="0.7 0.7 1.2"/></geometry></collision></link>
+  <joint name="bend" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 1.6"/><axis xyz="0 1 0"/>
+    <limit lower="-2.8" upper="2.8" effort="10" velocity="2"/></joint>
+  <link name="fore"><collision><origin xyz="0 0 0.9"/><geometry><box size="0.7 0.7 1.2"/></geometry></collision></link>
+  <joint name="tip" type="fixed"><parent link="fore"/><child link="tool"/><origin xyz="0 0 1.6"/></joint>
+  <link name="tool"/>
+</robot>
+"""
+URDFS = {"slider": (SLIDER, "lower"), "thick": (THICK, "tool")}
 
-@pytest.fixture(scope="module", params=["mara", "panda", "slider"])
+
+@pytest.fixture(scope="module", params=["mara", "panda", *URDFS])
 def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
-    if request.param != "slider":
+    if request.param not in URDFS:
         return robot_model(request.param)
-    path = write(tmp_path_factory.mktemp("slider") / "slider.urdf", SLIDER)
-    return RobotModel.from_urdf(path, ee_frame="lower")
+    urdf, tool = URDFS[request.param]
+    path = write(tmp_path_factory.mktemp(request.param) / "robot.urdf", urdf)
+    return RobotModel.from_urdf(path, ee_frame=tool)
 
 
 def _state(robot: RobotModel, q: Floats) -> SimState:
