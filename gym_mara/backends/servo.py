@@ -213,11 +213,12 @@ class ServoBackend(Backend):
         return (path[1:] - path[:-1]) / self.physics_step
 
     def _go_back(self, motion: Motion) -> None:
-        """Put the arms whose state diverged back to where they were before the step."""
+        """Put the arms whose state diverged back to where they were before the step; what they touched there was no contact."""
         diverged = self._diverged
         motion.q[diverged], motion.qd[diverged] = self._q[diverged], self._qd[diverged]
         motion.torque[diverged] = 0.0
         for arm in np.flatnonzero(diverged).tolist():
+            motion.contacts[arm] = ()
             self._rebuild(arm, self._q[arm], self._qd[arm])
         if self.on_divergence == "error":
             first = int(diverged.argmax())
