@@ -193,9 +193,13 @@ class ServoBackend(Backend):
         motion = self._run(self._commands(q_target))
         self._time += self._period
         self._diverged = has_diverged(motion.q, motion.qd, self.joint_velocity)
-        if np.count_nonzero(self._diverged):
+        diverged = np.count_nonzero(self._diverged)
+        if diverged:
             self._go_back(motion)
         self._q, self._qd, self._torque, self._contacts = motion
+        if diverged and self.on_divergence == "error":
+            first = int(self._diverged.argmax())
+            raise simulation_diverged(first, self._time[first])
         return self.state
 
     def _commands(self, q_target: Floats) -> Floats:
@@ -220,9 +224,6 @@ class ServoBackend(Backend):
         for arm in np.flatnonzero(diverged).tolist():
             motion.contacts[arm] = ()
             self._rebuild(arm, self._q[arm], self._qd[arm])
-        if self.on_divergence == "error":
-            first = int(diverged.argmax())
-            raise simulation_diverged(first, self._time[first])
 
     @property
     def state(self) -> SimState:

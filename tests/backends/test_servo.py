@@ -128,6 +128,16 @@ def test_an_arm_that_diverges_is_an_error_by_default(mara: RobotModel) -> None:
     assert backend.state.diverged is None
 
 
+def test_after_that_error_the_other_arms_are_where_the_engine_has_them(mara: RobotModel) -> None:
+    backend, alone = IdealEngine(mara, 2), IdealEngine(mara, 1)
+    with pytest.raises(SimulationDivergedError):
+        backend.step(np.array([np.full(6, 0.05), np.ones(6)]))
+    expected = alone.step(np.full((1, 6), 0.05))
+    assert (expected.q > 0.0).all()
+    np.testing.assert_array_equal(backend.state.q, [expected.q[0], np.zeros(6)])
+    np.testing.assert_array_equal(backend.state.qd, [expected.qd[0], np.zeros(6)])
+
+
 def test_contacts_right_after_a_reset_are_those_of_the_engine(mara: RobotModel) -> None:
     backend = IdealEngine(mara, 2)
     backend.reset(np.array([[1.2] + [0.0] * 5, [0.0] * 6]))
