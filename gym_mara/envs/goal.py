@@ -18,6 +18,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
 from gym_mara.errors import GymMaraError, one_of, positive_number
+from gym_mara.rendering.settings import STATE
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
 from gym_mara.types import Floats, Mask
@@ -53,14 +54,23 @@ class GoalSimulation(Simulation):
         settings: the tolerances and the reward.
 
     Raises:
-        GymMaraError: the task is not a reach task.
+        GymMaraError: the task is not a reach task, or the observation has no goals.
     """
 
     def __init__(self, options: Options, num_envs: int, settings: GoalSettings) -> None:
+        self._settings = settings
         super().__init__(options, num_envs)
+
+    def _prepare(self, options: Options) -> None:
         if not isinstance(self.task, ReachTask):
             raise GymMaraError(f"a goal environment needs a reach task, not {self.task!r}")
-        self._reach, self._settings = self.task, settings
+        if options.pixels.observation not in (STATE, "state+pixels"):
+            raise GymMaraError(
+                f"a goal environment observes its goals, so observation must be 'state' or 'state+pixels', not "
+                f"{options.pixels.observation!r}"
+            )
+        super()._prepare(options)
+        self._reach = self.task
         achieved, desired = (
             [observation.tool_position(self.robot)],
             [observation.target_position(self.robot)],
@@ -85,11 +95,6 @@ class GoalSimulation(Simulation):
             box = Observation(parts, overshoot).space
             spaces[name], self._columns[name] = box, slice(start, start + box.shape[0])
             start += box.shape[0]
-        if self.pixels is not None and self.pixels.settings.observation != "state+pixels":
-            raise GymMaraError(
-                f"a goal environment observes its goals, so observation must be 'state' or 'state+pixels', not "
-                f"{self.pixels.settings.observation!r}"
-            )
         self.form_space = Dict(spaces)
 
     def form(self, flat: Floats) -> dict[str, Floats]:

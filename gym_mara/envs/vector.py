@@ -69,7 +69,9 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             max_episode_steps = whole_number(
                 "max_episode_steps", max_episode_steps, or_else="None for no limit"
             )
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         sorted_options = Options.sort(task, robot, ee_frame, backend, options, type(self))
+        # From here on a thread may command an arm, so everything is checked before.
         self.simulation = self._make_simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
         self.single_observation_space = self.simulation.observation_space
@@ -77,7 +79,6 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.max_episode_steps = max_episode_steps
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 1.0 / self.simulation.backend.control_period,

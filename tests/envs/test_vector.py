@@ -18,6 +18,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, COPIES, pickled
+from tests.backends.fake import FakeBackend
 from tests.helpers import ENV_IDS, TASK_NAMES, Floats, robot_model
 
 MODES = ("NextStep", "SameStep")
@@ -417,6 +418,17 @@ def test_an_invalid_max_episode_steps_is_refused(steps: Any) -> None:
 def test_the_error_for_an_unknown_autoreset_mode_lists_the_valid_ones() -> None:
     with pytest.raises(GymMaraError, match=r"unknown autoreset_mode 'Never'.*Disabled, NextStep"):
         MaraVectorEnv(1, autoreset_mode="Never")
+
+
+def test_a_wrong_argument_is_found_before_a_backend_is_made(
+    fake_backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(FakeBackend, "__init__", lambda self, *_, **__: made.append(self))
+    for wrong in ({"autoreset_mode": "Never"}, {"max_episode_steps": 0}, {"render_mode": "x"}):
+        with pytest.raises(GymMaraError, match=next(iter(wrong))):
+            MaraVectorEnv(1, backend=fake_backend, **wrong)
+    assert not made
 
 
 @pytest.mark.parametrize(
