@@ -227,6 +227,10 @@ class Simulation:
             state.fill_actions(self.actions.action, self.actions.last_action)
         return self._reward(state, self._observe(state, None))
 
+    def judged(self, state: SimState) -> dict[str, NDArray[Any]]:
+        """The info of a step to a state without sensor noise."""
+        return {**self.rewards(state)[1], "collided": state.collided, **report(state)}
+
     def _reward(
         self, state: SimState, observation: Floats
     ) -> tuple[Floats, dict[str, NDArray[Any]]]:

@@ -185,17 +185,22 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
         """Execute the actions (N, A) of all arms for one control period.
 
+        With "NextStep" an arm whose episode has ended ignores its action and begins the next episode. If all have ended, no
+        time passes.
+
         Raises:
             GymMaraError: the actions have the wrong type or shape, or are not finite, or an ended episode was not reset. No arm
                 moves then.
         """
         resetting = self._ended
         xp = namespace(resetting)
-        some_reset = bool(xp.count_nonzero(resetting))
-        if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
+        num_reset = int(xp.count_nonzero(resetting))
+        if num_reset and self.autoreset_mode is AutoresetMode.DISABLED:
             raise GymMaraError(
                 "episodes have ended: call reset(options={'reset_mask': …}) for them before the next step"
             )
+        if num_reset == self.num_envs:
+            return self._begin_all()
         outcome = self.simulation.step(actions)
         observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
@@ -203,13 +208,13 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         if outcome.truncated is not None:
             truncated |= outcome.truncated
         stepped = ~resetting
-        if some_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
+        if num_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
             first, report = self.simulation.reset(resetting)
             observation = xp.where(resetting[:, None], first, observation)
             reward = xp.where(resetting, 0.0, reward)
             terminated, truncated = terminated & stepped, truncated & stepped
         info = _vector_info(outcome.info, stepped)
-        if some_reset:
+        if num_reset:
             _add_rows(info, report, resetting)
         ended = terminated | truncated
         if xp.count_nonzero(ended):
@@ -220,6 +225,21 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             self._ended = xp.asarray(ended, copy=True)
         self._last = xp.asarray(observation, copy=True)
         return self.simulation.present(observation), reward, terminated, truncated, info
+
+    def _begin_all(self) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
+        """The step in which all arms begin their next episodes, for NEXT_STEP. A real arm gets no further command."""
+        simulation, everyone = self.simulation, self._ended
+        xp = namespace(everyone)
+        # The keys of every other step, without values.
+        info = _vector_info(simulation.judged(simulation.backend.state), ~everyone)
+        observation, begun = simulation.reset(everyone)
+        _add_rows(info, begun, everyone)
+        self._ended = xp.zeros_like(everyone)
+        self._last = xp.asarray(observation, copy=True)
+        reward, terminated, truncated = (
+            xp.zeros_like(v) for v in (observation[:, 0], *2 * [everyone])
+        )
+        return simulation.present(observation), reward, terminated, truncated, info
 
     def _begin_next(
         self, outcome: Outcome, final: dict[str, Any], ended: Mask

@@ -215,6 +215,20 @@ def test_next_step_resets_in_the_next_step_and_ignores_its_action() -> None:
     assert not info["_distance"].any()
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_no_arm_is_moved_in_the_step_in_which_all_begin_their_next_episodes(
+    fake_backend: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = MaraVectorEnv(count, backend=fake_backend, max_episode_steps=1)
+    env.reset()
+    infos = env.step(np.full((count, 6), 0.1))[4]
+    with monkeypatch.context() as context:
+        context.delattr(FakeBackend, "step")
+        info = env.step(np.full((count, 6), np.nan))[4]
+    assert info.keys() == infos.keys() - {"statistics", "_statistics"}
+    assert env.step(np.full((count, 6), 0.1))[3].all()
+
+
 def test_same_step_returns_the_first_observation_and_the_final_one_in_info() -> None:
     env = MaraVectorEnv(2, max_episode_steps=2, autoreset_mode="SameStep")
     start, _ = env.reset()
