@@ -143,11 +143,13 @@ class Simulation:
         self.backend.reset(start, mask)
         chosen = slice(None) if mask is None else mask
         self.statistics.clear(chosen)
-        self._started = True
+        first, self._started = not self._started, True
         self._began[chosen] = True
         if self.pixels is not None:
             self.pixels.begin(self, mask)
         state, q = self.backend.state, start
+        if first and self.task.start_q is not None:
+            self.episodes.warn_of_collisions(state.collided)
         noise = noise_of(state)
         if noise is not None:
             arms = np.ones(self.num_envs, np.bool_) if mask is None else mask
