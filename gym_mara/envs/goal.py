@@ -18,6 +18,7 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
 from gym_mara.errors import GymMaraError, one_of, positive_number
+from gym_mara.registration import environment
 from gym_mara.rendering.settings import STATE
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
@@ -232,7 +233,7 @@ class MaraGoalVectorEnv(_GoalEnv, MaraVectorEnv):
     Args:
         num_envs: N.
         task, reward_type, position_tolerance, angle_tolerance: as in MaraGoalEnv.
-        **options: as in MaraVectorEnv.
+        **options: as in MaraVectorEnv; the default of `max_episode_steps` is that of MARAGoal-v0, 50.
 
     Raises:
         GymMaraError: a name is unknown, a value is out of its range, or the task is not a reach task.
@@ -254,3 +255,6 @@ class MaraGoalVectorEnv(_GoalEnv, MaraVectorEnv):
 
     def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
         return GoalSimulation(options, num_envs, self._goals)
+
+    def _episode_steps(self, task: str | Task) -> int:
+        return environment("MARAGoal-v0").max_episode_steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -21,9 +21,10 @@ from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import first_view, view_of
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
+from gym_mara.registration import environment
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
-from gym_mara.tasks import MAX_EPISODE_STEPS, Task
+from gym_mara.tasks import Task
 from gym_mara.types import Floats, Mask
 
 
@@ -40,7 +41,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         num_envs: N.
         task, robot, ee_frame, backend, **options: as in MaraEnv.
         render_mode: "rgb_array" for pictures of every arm, or None.
-        max_episode_steps: the number of steps after which an episode is truncated; None for no limit.
+        max_episode_steps: the number of steps after which an episode is truncated; None for no limit, and "default" for that of the
+            environment with the name of the task, or of the task.
         autoreset_mode: Gymnasium's autoreset mode: "NextStep", "SameStep" or "Disabled".
 
     Raises:
@@ -57,7 +59,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         ee_frame: str | None = None,
         backend: str = DEFAULT_BACKEND,
         render_mode: str | None = None,
-        max_episode_steps: int | None = MAX_EPISODE_STEPS,
+        max_episode_steps: int | Literal["default"] | None = "default",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
@@ -65,12 +67,16 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             True  # until the end of __init__: Gymnasium calls close() even if __init__ fails
         )
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
-        if max_episode_steps is not None:
+        default = isinstance(max_episode_steps, str) and max_episode_steps == "default"
+        if max_episode_steps is not None and not default:
             max_episode_steps = whole_number(
                 "max_episode_steps", max_episode_steps, or_else="None for no limit"
             )
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         sorted_options = Options.sort(task, robot, ee_frame, backend, options, type(self))
+        self.max_episode_steps = (
+            self._episode_steps(task) if isinstance(max_episode_steps, str) else max_episode_steps
+        )
         # From here on a thread may command an arm, so everything is checked before.
         self.simulation = self._make_simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
@@ -78,7 +84,6 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         self.single_action_space = self.simulation.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.max_episode_steps = max_episode_steps
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 1.0 / self.simulation.backend.control_period,
@@ -94,6 +99,12 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
         return Simulation(options, num_envs)
+
+    def _episode_steps(self, task: str | Task) -> int:
+        """How long episodes are by default."""
+        if isinstance(task, str):
+            return environment(task).max_episode_steps
+        return task.episode_steps
 
     def reset(
         self,

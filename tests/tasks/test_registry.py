@@ -186,6 +186,7 @@ def test_a_cell_that_defines_and_registers_a_task_can_run_again() -> None:
     with pytest.warns(UserWarning, match="Overriding environment notebook/Own-v0"):
         cell(0.03)
     task = make_vector_env("notebook/Own-v0", 1).simulation.task
+    assert MaraVectorEnv(1, task).max_episode_steps == task.episode_steps
     assert isinstance(task, ReachTask)
     assert task.kappa == 0.03
     with pytest.raises(GymMaraError, match="another task has the name 'notebook/Own-v0'"):
@@ -212,5 +213,7 @@ def test_a_vector_environment_is_made_by_its_name(name: str, form: str) -> None:
     assert type(envs) is (MaraGoalVectorEnv if name == "MARAGoal-v0" else MaraVectorEnv)
     own = gymnasium.spec(environment_id(name)).max_episode_steps
     assert envs.max_episode_steps == own
+    made = {"task": environment(name).task, **environment(name).keywords}
+    assert type(envs)(1, **made).max_episode_steps == own
     assert make_vector_env(name, 2, max_episode_steps=None).max_episode_steps is None
     assert environment_id(name) == f"gym_mara/{name}"
