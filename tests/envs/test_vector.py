@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -463,6 +464,14 @@ def test_invalid_actions_move_no_arm(actions: Floats, message: str) -> None:
     with pytest.raises(GymMaraError, match=message):
         env.step(actions)
     assert str(env.save_state()["backend"]) == before
+
+
+@pytest.mark.parametrize("shape", [(6,), (2, 6)])
+def test_the_error_for_a_shape_names_the_whole_shape_also_for_one_arm(shape: Any) -> None:
+    env = MaraVectorEnv(1)
+    env.reset()
+    with pytest.raises(GymMaraError, match=re.escape(f"shape {shape}; mara needs (1, 6)")):
+        env.step(np.zeros(shape))
 
 
 def test_a_collision_of_one_arm_does_not_affect_the_others() -> None:
