@@ -199,7 +199,7 @@ class ServoBackend(Backend):
         self._q, self._qd, self._torque, self._contacts = motion
         if diverged and self.on_divergence == "error":
             first = int(self._diverged.argmax())
-            raise simulation_diverged(first, self._time[first])
+            raise simulation_diverged(self.first_arm + first, self._time[first])
         return self.state
 
     def _commands(self, q_target: Floats) -> Floats:
