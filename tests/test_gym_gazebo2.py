@@ -194,6 +194,8 @@ def test_real_speed_moves_the_joints_at_the_given_velocity(
         ({"port": 11345}, "'port' has no meaning here.*no simulator"),
         ({"velocity": 0.3}, "give real_speed=True too"),
         ({"real_speed": True, "velocity": 0.0}, "velocity must be finite and positive"),
+        ({"real_speed": True, "max_joint_velocity": 0.3}, "give velocity with real_speed"),
+        ({"gui": True, "render_mode": "rgb_array"}, "gui shows .*not 'rgb_array'"),
         ({"gzclient": True}, "unknown keyword argument 'gzclient'"),
     ],
 )

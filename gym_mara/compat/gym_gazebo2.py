@@ -74,6 +74,15 @@ class GazeboMaraEnv(MaraEnv):
             raise GymMaraError(
                 "'velocity' has no effect without real_speed: give real_speed=True too"
             )
+        if real_speed and options.get("max_joint_velocity") is not None:
+            raise GymMaraError(
+                "real_speed and max_joint_velocity both limit the joint speed: give velocity with real_speed, or "
+                "max_joint_velocity alone"
+            )
+        if gui and options.get("render_mode") not in (None, "human"):
+            raise GymMaraError(
+                f"gui shows the arm in the browser, which is render_mode='human', not {options['render_mode']!r}: leave out one"
+            )
         if real_speed:
             speed = RUN_VELOCITY if velocity is None else velocity
             options["max_joint_velocity"] = positive_number("velocity", speed, "rad/s")
