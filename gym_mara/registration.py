@@ -36,6 +36,9 @@ def register_task(
 ) -> None:
     """Register a task as an environment of Gymnasium, single and vectorised.
 
+    A task may be registered again after its class was defined again, as by a notebook's cell: it takes the place of the first
+    one. Gymnasium warns of that.
+
     Args:
         name: the name of the task and the id of the environment, such as "my_package/MARATouch-v0".
         task: the task; None for the task of an entry point `gym_mara.tasks` with this name.
@@ -47,12 +50,22 @@ def register_task(
     """
     if task is not None and not isinstance(task, Task):
         raise GymMaraError(f"task must be a Task, such as TouchTask(), not {task!r}")
-    if task is not None and TASKS.setdefault(name, task) != task:
-        raise GymMaraError(f"another task has the name {name!r}: choose another name")
+    name = name.removeprefix(f"{_NAMESPACE}/")
+    if task is not None:
+        if not _same(TASKS.get(name, task), task):
+            raise GymMaraError(f"another task has the name {name!r}: choose another name")
+        TASKS[name] = task
     steps = MAX_EPISODE_STEPS if task is None else task.episode_steps
     if max_episode_steps is not None:
         steps = whole_number("max_episode_steps", max_episode_steps)
     _register(name, Environment(name, steps), {"task": name})
+
+
+def _same(one: Task, other: Task) -> bool:
+    """Whether two tasks are equal, or their classes are two definitions of the same one."""
+    old, new = type(one), type(other)
+    named = (old.__module__, old.__qualname__) == (new.__module__, new.__qualname__)
+    return one == other or (old is not new and named)
 
 
 def _register(name: str, environment: Environment, keywords: dict[str, str]) -> None:

@@ -159,13 +159,16 @@ def compare(recorded: Record, now: Record, tolerance: float = 1e-9) -> list[Move
 def check(file: Path, backend: str | None = None, tolerance: float = 1e-9) -> list[Moved]:
     """Compute the rewards of a record again, on its backend or another, and return the values that have changed.
 
+    Another backend gets those of the record's settings that it has.
+
     Raises:
         GymMaraError: the file is missing or damaged, the task now has other terms, or the tolerance is negative or not
             finite.
     """
     _check_tolerance(tolerance)
     recorded = read(file)
-    now = compute(recorded.env, backend or recorded.backend, recorded.options, recorded.q)
+    backend = backend or recorded.backend
+    now = compute(recorded.env, backend, _options_for(backend, recorded), recorded.q)
     return compare(recorded, now, tolerance)
 
 
@@ -259,9 +262,23 @@ def _check_tolerance(tolerance: float) -> None:
         raise GymMaraError(f"tolerance must be finite and not negative, not {tolerance!r}")
 
 
+def _known(env: str, backend: str) -> set[str]:
+    """The names of the options that a record may have."""
+    return {*ROBOT_KEYWORDS, *task_keywords(env), *backend_settings(backend)} - _OF_MACHINE
+
+
+def _options_for(backend: str, recorded: Record) -> dict[str, Any]:
+    """The options of a record, without the settings of its backend that another backend does not have."""
+    if backend == recorded.backend:
+        return recorded.options
+    foreign = recorded.options.keys() - _known(recorded.env, backend)
+    dropped = foreign.intersection(backend_settings(recorded.backend)) if foreign else foreign
+    return {name: value for name, value in recorded.options.items() if name not in dropped}
+
+
 def _check_options(env: str, backend: str, options: dict[str, Any]) -> None:
     """Raises GymMaraError if an option has no effect on a reward, such as one of the pictures."""
-    known = {*ROBOT_KEYWORDS, *task_keywords(env), *backend_settings(backend)} - _OF_MACHINE
+    known = _known(env, backend)
     for name in options:
         if name not in known:
             raise unknown("keyword argument", name, known, " of a reward record")

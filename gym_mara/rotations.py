@@ -62,9 +62,21 @@ def canonical(q: Floats) -> Floats:
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:
-    """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, with w = Re(a ⊗ conj(b))."""
+    """The angle (...,) in [0, π] rad of the rotation from b to a: 2 arccos |w|, with w = Re(a ⊗ conj(b)).
+
+    Near zero the arc cosine has half of the digits: its error is up to 7e-8 rad, and in single precision it would be 1e-3 rad.
+    Single precision therefore uses the chords |a - b| = 2 sin(θ/4) and |a + b| = 2 cos(θ/4), which takes three times as long.
+    """
+    if a.dtype.itemsize < 8:
+        return _angle_of_chords(a, b)
     xp, one, two = _ONE_AND_TWO.like(a)
     return two * xp.acos(xp.minimum(xp.abs(xp.vecdot(a, b)), one))
+
+
+def _angle_of_chords(a: Floats, b: Floats) -> Floats:
+    xp = namespace(a)
+    chords = [xp.sqrt(xp.sum(each * each, axis=-1)) for each in (a - b, a + b)]
+    return 4.0 * xp.atan2(xp.minimum(*chords), xp.maximum(*chords))
 
 
 def to_vector(q: Floats) -> Floats:

@@ -44,8 +44,8 @@ class SimState:
     contacts: tuple[tuple[Contact, ...], ...] | None = None
     """The contacts of each arm during the last control period, N tuples; None if the engine reports no contacts."""
     diverged: Mask | None = None
-    """Whether the arm's state diverged in the last step (N,); the other fields then hold the state before that step.
-    None if the state cannot diverge."""
+    """Whether the arm's state diverged in the last step (N,); the other fields then hold the state before that step, without torques
+    and contacts. None if the state cannot diverge."""
     parameters: Mapping[str, Floats] | None = None
     """The random parameters of each arm's episode by name, each (N, …); None without randomisation."""
     action: Floats | None = None

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 import scipy.stats
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium.utils.env_checker import check_env
 
 from gym_mara.compat.gym_gazebo2 import GazeboMaraEnv
@@ -167,6 +167,18 @@ def test_original_observation_replaces_the_velocity_with_the_jacobian_times_the_
     assert golden("kinematics_golden.csv")
 
 
+def test_original_observation_with_pictures_is_in_its_space() -> None:
+    options: dict[str, Any] = {"observation": "state+pixels", "pixel_size": 8}
+    env = GazeboMaraEnv(original_observation=True, **options)
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    plain = GazeboMaraEnv(**options).observation_space
+    assert isinstance(plain, Dict)
+    assert isinstance(env.observation_space, Dict)
+    assert env.observation_space.keys() == plain.keys()
+    assert env.observation_space["state"] != plain["state"]
+
+
 @pytest.mark.filterwarnings("ignore:.*action space", "ignore:.*symmetric")
 @pytest.mark.parametrize("options", [{}, {"original_observation": True}, {"real_speed": True}])
 def test_gymnasiums_checker_accepts_the_environment(options: dict[str, Any]) -> None:
@@ -194,6 +206,9 @@ def test_real_speed_moves_the_joints_at_the_given_velocity(
         ({"port": 11345}, "'port' has no meaning here.*no simulator"),
         ({"velocity": 0.3}, "give real_speed=True too"),
         ({"real_speed": True, "velocity": 0.0}, "velocity must be finite and positive"),
+        ({"real_speed": True, "max_joint_velocity": 0.3}, "give velocity with real_speed"),
+        ({"gui": True, "render_mode": "rgb_array"}, "gui shows .*not 'rgb_array'"),
+        ({"original_observation": True, "observation": "pixels"}, "concerns the state: .*'pixels'"),
         ({"gzclient": True}, "unknown keyword argument 'gzclient'"),
     ],
 )

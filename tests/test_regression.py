@@ -17,7 +17,7 @@ from gym_mara.backends import simulated_backends
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import TASKS
 from gym_mara.tasks.reach import ReachTask
-from tests.helpers import joint_xml, robot_model, urdf_xml, write
+from tests.helpers import Floats, joint_xml, robot_model, urdf_xml, write
 
 RECORDS = Path(__file__).parent / "rewards"
 
@@ -158,6 +158,27 @@ def test_an_option_without_effect_on_a_reward_is_refused(
     write(file, f"{HEADER}{json.dumps({**ABOUT, 'options': option})}\n{COLUMNS}\n0,0,0,0,0,0,1\n")
     with pytest.raises(GymMaraError, match=f"unknown keyword argument '{name}'"):
         regression.check(file)
+
+
+def test_another_backend_gets_the_settings_that_it_has(
+    tmp_path: Path, fake_backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {"kappa": 0.03, "control_period": 0.05, "wall": 0.5}
+    regression.write(
+        tmp_path / "record.csv", regression.record("MARA-v0", fake_backend, settings, 8)
+    )
+    computed: list[Any] = []
+    compute = regression.compute
+
+    def noted(env: str, backend: str, options: dict[str, Any], q: Floats) -> regression.Record:
+        computed.append(options)
+        return compute(env, backend, options, q)
+
+    monkeypatch.setattr(regression, "compute", noted)
+    moved = regression.check(tmp_path / "record.csv", "pinocchio")
+    assert {each.name for each in moved} <= {"collided"}
+    assert computed == [{"kappa": 0.03, "control_period": 0.05}]
+    assert regression.check(tmp_path / "record.csv") == []
 
 
 HEADER = "# gym_mara reward record: "

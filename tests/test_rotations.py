@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -106,6 +109,20 @@ def test_the_angle_of_known_rotations() -> None:
     turns = np.array([0.0, 0.3, np.pi / 2, np.pi])
     about_y = np.stack([np.cos(turns / 2), np.zeros(4), np.sin(turns / 2), np.zeros(4)], axis=-1)
     np.testing.assert_allclose(rotations.angle_between(about_y, identity), turns, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", [np.float32, torch.tensor], ids=["numpy", "torch"])
+def test_small_angles_are_as_accurate_in_single_precision(form: Any) -> None:
+    # Multiples of 2e-5 from 0 on; the arc cosine would be wrong by up to 1e-3 rad at all of them.
+    turns = 2e-5 * np.arange(50.0)
+    axis = np.array([0.48, -0.6, 0.64])
+    small = np.column_stack([np.cos(turns / 2), np.sin(turns / 2)[:, None] * axis])
+    target = np.tile([0.5, 0.1, -0.7, 0.5], (50, 1))
+    a, b = (form(q.astype(np.float32)) for q in (rotations.multiply(small, target), target))
+    angle = np.asarray(rotations.angle_between(a, b))
+    assert angle.dtype == np.float32
+    np.testing.assert_allclose(angle, turns, rtol=0.0, atol=5e-7)
+    assert (np.asarray(rotations.angle_between(-a, b)) == angle).all()
 
 
 @given(arrays(np.float64, 4, elements=st.floats(-1e3, 1e3)).filter(_is_direction))

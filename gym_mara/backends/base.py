@@ -40,6 +40,8 @@ class Backend(ABC):
     """Whether parameters are drawn for each episode; if so `begin_episodes` is called before its reset."""
     overshoot: float = 0.0
     """How far joints may be beyond their limits, rad (m): with dynamics, end stops give way a little."""
+    first_arm: int = 0
+    """The number of the first arm, for messages: not zero in a worker process, whose backend has a block of the arms."""
     joint_velocity: Floats
     """The highest velocity of each joint in this backend (J,), rad/s (m/s for a prismatic joint)."""
     control_period: float

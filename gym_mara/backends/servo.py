@@ -193,9 +193,13 @@ class ServoBackend(Backend):
         motion = self._run(self._commands(q_target))
         self._time += self._period
         self._diverged = has_diverged(motion.q, motion.qd, self.joint_velocity)
-        if np.count_nonzero(self._diverged):
+        diverged = np.count_nonzero(self._diverged)
+        if diverged:
             self._go_back(motion)
         self._q, self._qd, self._torque, self._contacts = motion
+        if diverged and self.on_divergence == "error":
+            first = int(self._diverged.argmax())
+            raise simulation_diverged(self.first_arm + first, self._time[first])
         return self.state
 
     def _commands(self, q_target: Floats) -> Floats:
@@ -213,15 +217,13 @@ class ServoBackend(Backend):
         return (path[1:] - path[:-1]) / self.physics_step
 
     def _go_back(self, motion: Motion) -> None:
-        """Put the arms whose state diverged back to where they were before the step."""
+        """Put the arms whose state diverged back to where they were before the step; what they touched there was no contact."""
         diverged = self._diverged
         motion.q[diverged], motion.qd[diverged] = self._q[diverged], self._qd[diverged]
         motion.torque[diverged] = 0.0
         for arm in np.flatnonzero(diverged).tolist():
+            motion.contacts[arm] = ()
             self._rebuild(arm, self._q[arm], self._qd[arm])
-        if self.on_divergence == "error":
-            first = int(diverged.argmax())
-            raise simulation_diverged(first, self._time[first])
 
     @property
     def state(self) -> SimState:

@@ -100,6 +100,7 @@ class WorkerBackend(Backend):
         size = num_envs // workers
         self._rows = [slice(start, start + size) for start in range(0, num_envs, size)]
         self._workers = Workers(functools.partial(backend, robot, size, **settings), workers)
+        self._workers.call("__setattr__", [("first_arm", rows.start) for rows in self._rows])
         self._states: list[SimState] | None = None
 
     @property

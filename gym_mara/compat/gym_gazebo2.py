@@ -74,6 +74,20 @@ class GazeboMaraEnv(MaraEnv):
             raise GymMaraError(
                 "'velocity' has no effect without real_speed: give real_speed=True too"
             )
+        if real_speed and options.get("max_joint_velocity") is not None:
+            raise GymMaraError(
+                "real_speed and max_joint_velocity both limit the joint speed: give velocity with real_speed, or "
+                "max_joint_velocity alone"
+            )
+        if gui and options.get("render_mode") not in (None, "human"):
+            raise GymMaraError(
+                f"gui shows the arm in the browser, which is render_mode='human', not {options['render_mode']!r}: leave out one"
+            )
+        if original_observation and options.get("observation") in ("pixels", "joints+pixels"):
+            raise GymMaraError(
+                "original_observation concerns the state: give observation='state' or 'state+pixels', not "
+                f"{options['observation']!r}"
+            )
         if real_speed:
             speed = RUN_VELOCITY if velocity is None else velocity
             options["max_joint_velocity"] = positive_number("velocity", speed, "rad/s")
@@ -89,7 +103,8 @@ class GazeboMaraEnv(MaraEnv):
                 [replacement if part.name == replacement.name else part for part in parts],
                 self.simulation.backend.overshoot,
             )
-            self.observation_space = self.simulation.observation.space  # type: ignore[assignment]
+            self.simulation.form_space = self.simulation.observation.space
+            self.observation_space = self.simulation.observation_space
 
     def set_episode_size(self, episode_size: int) -> None:
         """Set the length of the current and all later episodes, steps."""

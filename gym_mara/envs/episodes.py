@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from gym_mara import rotations
 from gym_mara.arrays import host, like, namespace
+from gym_mara.collision.coal import touching_links
 from gym_mara.envs.given import Given
 from gym_mara.envs.streams import Streams, drawn_episodes
 from gym_mara.envs.workspace import RobotWorkspace
@@ -86,6 +88,17 @@ class Episodes:
         self.start, *goal = new
         if goal:
             self._aim(goal, mask, self.start)
+
+    def warn_of_collisions(self, collided: Mask) -> None:
+        """Warn if arms (N,) have collided at their starts: what the keyword argument gives is not checked before."""
+        xp = namespace(collided)
+        if xp.count_nonzero(collided):
+            q = host(self.start)[int(xp.argmax(xp.astype(collided, xp.int64)))]
+            links = ", ".join(sorted(touching_links(self._robot, q)))
+            warnings.warn(
+                f"start_q {q.tolist()} is in collision{f', where these links touch: {links}' if links else ''}; give another start",
+                stacklevel=4,
+            )
 
     def _chosen(self, mask: Mask | None) -> Mask:
         return np.ones(self._num_envs, np.bool_) if mask is None else host(mask)

@@ -19,6 +19,8 @@ from gym_mara.envs.simulation import Simulation
 from gym_mara.envs.single import MaraEnv
 from gym_mara.envs.vector import MaraVectorEnv
 from gym_mara.errors import GymMaraError, one_of, positive_number
+from gym_mara.registration import environment
+from gym_mara.rendering.settings import STATE
 from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Observation, Part, ReachTask, Task, observation
 from gym_mara.types import Floats, Mask
@@ -54,14 +56,23 @@ class GoalSimulation(Simulation):
         settings: the tolerances and the reward.
 
     Raises:
-        GymMaraError: the task is not a reach task.
+        GymMaraError: the task is not a reach task, or the observation has no goals.
     """
 
     def __init__(self, options: Options, num_envs: int, settings: GoalSettings) -> None:
+        self._settings = settings
         super().__init__(options, num_envs)
+
+    def _prepare(self, options: Options) -> None:
         if not isinstance(self.task, ReachTask):
             raise GymMaraError(f"a goal environment needs a reach task, not {self.task!r}")
-        self._reach, self._settings = self.task, settings
+        if options.pixels.observation not in (STATE, "state+pixels"):
+            raise GymMaraError(
+                f"a goal environment observes its goals, so observation must be 'state' or 'state+pixels', not "
+                f"{options.pixels.observation!r}"
+            )
+        super()._prepare(options)
+        self._reach = self.task
         achieved, desired = (
             [observation.tool_position(self.robot)],
             [observation.target_position(self.robot)],
@@ -86,11 +97,6 @@ class GoalSimulation(Simulation):
             box = Observation(parts, overshoot).space
             spaces[name], self._columns[name] = box, slice(start, start + box.shape[0])
             start += box.shape[0]
-        if self.pixels is not None and self.pixels.settings.observation != "state+pixels":
-            raise GymMaraError(
-                f"a goal environment observes its goals, so observation must be 'state' or 'state+pixels', not "
-                f"{self.pixels.settings.observation!r}"
-            )
         self.form_space = Dict(spaces)
 
     def form(self, flat: Floats) -> dict[str, Floats]:
@@ -298,7 +304,7 @@ class MaraGoalVectorEnv(_GoalEnv, MaraVectorEnv):
     Args:
         num_envs: N.
         task, reward_type, position_tolerance, angle_tolerance: as in MaraGoalEnv.
-        **options: as in MaraVectorEnv.
+        **options: as in MaraVectorEnv; the default of `max_episode_steps` is that of MARAGoal-v0, 50.
 
     Raises:
         GymMaraError: a name is unknown, a value is out of its range, or the task is not a reach task.
@@ -320,3 +326,6 @@ class MaraGoalVectorEnv(_GoalEnv, MaraVectorEnv):
 
     def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
         return GoalSimulation(options, num_envs, self._goals)
+
+    def _episode_steps(self, task: str | Task) -> int:
+        return environment("MARAGoal-v0").max_episode_steps

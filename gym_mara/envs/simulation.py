@@ -150,11 +150,13 @@ class Simulation:
         self.backend.reset(start, mask)
         chosen = slice(None) if mask is None else mask
         self.statistics.clear(chosen)
-        self._started = True
+        first, self._started = not self._started, True
         self._began[chosen] = True
         if self.pixels is not None:
             self.pixels.begin(self, mask)
         state, q = self.backend.state, start
+        if first and self.task.start_q is not None:
+            self.episodes.warn_of_collisions(state.collided)
         noise = noise_of(state)
         if noise is not None:
             arms = np.ones(self.num_envs, np.bool_) if mask is None else mask
@@ -233,6 +235,10 @@ class Simulation:
             state = copy.copy(state)
             state.fill_actions(self.actions.action, self.actions.last_action)
         return self._reward(state, self._observe(state, None))
+
+    def judged(self, state: SimState) -> dict[str, NDArray[Any]]:
+        """The info of a step to a state without sensor noise."""
+        return {**self.rewards(state)[1], "collided": state.collided, **report(state)}
 
     def _reward(
         self, state: SimState, observation: Floats

@@ -119,7 +119,7 @@ class MaraEnv(gymnasium.Env[Floats, NDArray[np.float32]]):
         Raises:
             GymMaraError: the action has the wrong type or shape, or is not finite. The arm does not move then.
         """
-        batch = self.simulation.actions.array(action)[None]
+        batch = self.simulation.actions.of_one_arm(action)
         # The viewer steps the simulation in real time, and may replace the action.
         step = self.simulation.step if self.viewer is None else self.viewer.step
         outcome = step(batch)

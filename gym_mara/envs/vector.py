@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -22,9 +22,10 @@ from gym_mara.envs.single import checked_render_mode
 from gym_mara.envs.streams import Streams
 from gym_mara.envs.view import first_view, view_of
 from gym_mara.errors import GymMaraError, short, unknown, whole_number
+from gym_mara.registration import environment
 from gym_mara.rendering import Pictures
 from gym_mara.robot import RobotLike
-from gym_mara.tasks import MAX_EPISODE_STEPS, Task
+from gym_mara.tasks import Task
 from gym_mara.types import Floats, Mask
 
 
@@ -41,7 +42,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         num_envs: N.
         task, robot, ee_frame, backend, **options: as in MaraEnv.
         render_mode: "rgb_array" for pictures of every arm, or None.
-        max_episode_steps: the number of steps after which an episode is truncated; None for no limit.
+        max_episode_steps: the number of steps after which an episode is truncated; None for no limit, and "default" for that of the
+            environment with the name of the task, or of the task.
         autoreset_mode: Gymnasium's autoreset mode: "NextStep", "SameStep" or "Disabled".
 
     Raises:
@@ -58,7 +60,7 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         ee_frame: str | None = None,
         backend: str = DEFAULT_BACKEND,
         render_mode: str | None = None,
-        max_episode_steps: int | None = MAX_EPISODE_STEPS,
+        max_episode_steps: int | Literal["default"] | None = "default",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **options: Any,
     ) -> None:
@@ -66,19 +68,23 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             True  # until the end of __init__: Gymnasium calls close() even if __init__ fails
         )
         self.render_mode = checked_render_mode(render_mode, ["rgb_array"])
-        if max_episode_steps is not None:
+        default = isinstance(max_episode_steps, str) and max_episode_steps == "default"
+        if max_episode_steps is not None and not default:
             max_episode_steps = whole_number(
                 "max_episode_steps", max_episode_steps, or_else="None for no limit"
             )
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         sorted_options = Options.sort(task, robot, ee_frame, backend, options, type(self))
+        self.max_episode_steps = (
+            self._episode_steps(task) if isinstance(max_episode_steps, str) else max_episode_steps
+        )
+        # From here on a thread may command an arm, so everything is checked before.
         self.simulation = self._make_simulation(sorted_options, num_envs)
         self.num_envs = self.simulation.num_envs
         self.single_observation_space = self.simulation.observation_space
         self.single_action_space = self.simulation.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.max_episode_steps = max_episode_steps
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 1.0 / self.simulation.backend.control_period,
@@ -94,6 +100,12 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
 
     def _make_simulation(self, options: Options, num_envs: int) -> Simulation:
         return Simulation(options, num_envs)
+
+    def _episode_steps(self, task: str | Task) -> int:
+        """How long episodes are by default."""
+        if isinstance(task, str):
+            return environment(task).max_episode_steps
+        return task.episode_steps
 
     def reset(
         self,
@@ -190,17 +202,22 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
     def step(self, actions: ArrayLike) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
         """Execute the actions (N, A) of all arms for one control period.
 
+        With "NextStep" an arm whose episode has ended ignores its action and begins the next episode. If all have ended, no
+        time passes.
+
         Raises:
             GymMaraError: the actions have the wrong type or shape, or are not finite, or an ended episode was not reset. No arm
                 moves then.
         """
         resetting = self._ended
         xp = namespace(resetting)
-        some_reset = bool(xp.count_nonzero(resetting))
-        if some_reset and self.autoreset_mode is AutoresetMode.DISABLED:
+        num_reset = int(xp.count_nonzero(resetting))
+        if num_reset and self.autoreset_mode is AutoresetMode.DISABLED:
             raise GymMaraError(
                 "episodes have ended: call reset(options={'reset_mask': …}) for them before the next step"
             )
+        if num_reset == self.num_envs:
+            return self._begin_all()
         outcome = self.simulation.step(actions)
         observation, reward, terminated = outcome.observation, outcome.reward, outcome.terminated
         limit = np.inf if self.max_episode_steps is None else self.max_episode_steps
@@ -208,13 +225,13 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         if outcome.truncated is not None:
             truncated |= outcome.truncated
         stepped = ~resetting
-        if some_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
+        if num_reset:  # NEXT_STEP: these arms begin an episode and ignore their action
             first, report = self.simulation.reset(resetting)
             observation = xp.where(resetting[:, None], first, observation)
             reward = xp.where(resetting, 0.0, reward)
             terminated, truncated = terminated & stepped, truncated & stepped
         info = _vector_info(outcome.info, stepped)
-        if some_reset:
+        if num_reset:
             _add_rows(info, report, resetting)
         ended = terminated | truncated
         if xp.count_nonzero(ended):
@@ -225,6 +242,21 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
             self._ended = xp.asarray(ended, copy=True)
         self._last = xp.asarray(observation, copy=True)
         return self.simulation.present(observation), reward, terminated, truncated, info
+
+    def _begin_all(self) -> tuple[Floats, Floats, Mask, Mask, dict[str, Any]]:
+        """The step in which all arms begin their next episodes, for NEXT_STEP. A real arm gets no further command."""
+        simulation, everyone = self.simulation, self._ended
+        xp = namespace(everyone)
+        # The keys of every other step, without values.
+        info = _vector_info(simulation.judged(simulation.backend.state), ~everyone)
+        observation, begun = simulation.reset(everyone)
+        _add_rows(info, begun, everyone)
+        self._ended = xp.zeros_like(everyone)
+        self._last = xp.asarray(observation, copy=True)
+        reward, terminated, truncated = (
+            xp.zeros_like(v) for v in (observation[:, 0], *2 * [everyone])
+        )
+        return simulation.present(observation), reward, terminated, truncated, info
 
     def _begin_next(
         self, outcome: Outcome, final: dict[str, Any], ended: Mask

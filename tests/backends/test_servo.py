@@ -72,8 +72,11 @@ class IdealEngine(ServoBackend):
     def _run(self, velocities: Floats) -> Motion:
         q = self._q + self.physics_step * velocities.sum(axis=0)
         qd = velocities[-1].copy()
-        qd[qd[:, 0] > 1.0] = np.nan
-        return Motion(q, qd, torque=qd.copy(), contacts=[()] * len(q))
+        wild = qd[:, 0] > 1.0
+        qd[wild] = np.nan
+        touching: tuple[Contact, ...] = (Contact(("a", "b"), 0.1),)
+        contacts = [touching if each else () for each in wild]
+        return Motion(q, qd, torque=qd.copy(), contacts=contacts)
 
     def _put_at_rest(self, arms: NDArray[np.intp], q: Floats) -> list[tuple[Contact, ...]]:
         return [(Contact(("a", "b"), 0.1),) if row[0] > 1.0 else () for row in q]
@@ -112,6 +115,9 @@ def test_an_arm_that_diverges_is_rebuilt_where_it_was(mara: RobotModel) -> None:
         np.testing.assert_array_equal(rebuilt, last[1])
     assert state.torque is not None
     assert state.torque[1].tolist() == [0.0] * 6
+    # What an arm touches while it diverges is no collision.
+    assert state.contacts == ((), ())
+    assert not state.collided.any()
 
 
 def test_an_arm_that_diverges_is_an_error_by_default(mara: RobotModel) -> None:
@@ -120,6 +126,16 @@ def test_an_arm_that_diverges_is_an_error_by_default(mara: RobotModel) -> None:
         backend.step(np.array([np.zeros(6), np.ones(6)]))
     assert np.isfinite(backend.state.qd).all()
     assert backend.state.diverged is None
+
+
+def test_after_that_error_the_other_arms_are_where_the_engine_has_them(mara: RobotModel) -> None:
+    backend, alone = IdealEngine(mara, 2), IdealEngine(mara, 1)
+    with pytest.raises(SimulationDivergedError):
+        backend.step(np.array([np.full(6, 0.05), np.ones(6)]))
+    expected = alone.step(np.full((1, 6), 0.05))
+    assert (expected.q > 0.0).all()
+    np.testing.assert_array_equal(backend.state.q, [expected.q[0], np.zeros(6)])
+    np.testing.assert_array_equal(backend.state.qd, [expected.qd[0], np.zeros(6)])
 
 
 def test_contacts_right_after_a_reset_are_those_of_the_engine(mara: RobotModel) -> None:

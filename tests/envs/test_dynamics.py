@@ -93,7 +93,10 @@ def test_the_same_keywords_run_on_both_engines() -> None:
 
 def test_info_has_torques_and_contacts(backend: str) -> None:
     env = MaraEnv("MARACollision-v0", backend=backend, start_q=COLLIDING_Q, on_collision="continue")
-    _, info = env.reset(seed=0)
+    with pytest.warns(
+        UserWarning, match="start_q .* is in collision, .*: motor4_link, motor5_link, table"
+    ):
+        _, info = env.reset(seed=0)
     assert info["contacts"]
     _, _, _, _, info = env.step(np.array(COLLIDING_Q, np.float32))
     assert info["collided"]

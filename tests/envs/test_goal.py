@@ -23,6 +23,7 @@ from gym_mara.state import SimState
 from gym_mara.tasks import Goal, Part, ReachTask, Task, Workspace, observation
 from gym_mara.testing import COLLIDING_Q, COPIES
 from gym_mara.types import Floats, Mask
+from tests.backends.fake import FakeBackend
 from tests.helpers import TARGET_Q, robot_model
 
 RANDOM = "MARARandomTarget-v0"
@@ -371,6 +372,22 @@ class StillTask(Task):
 
 
 @pytest.mark.parametrize("make", [MaraGoalEnv, MaraGoalVectorEnv])
-def test_another_task_than_a_reach_task_is_refused(make: Any) -> None:
-    with pytest.raises(GymMaraError, match="needs a reach task"):
-        make(task=StillTask())
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": StillTask()}, "needs a reach task"),
+        ({"observation": "pixels"}, "observation must be 'state' or 'state\\+pixels'"),
+    ],
+)
+def test_what_has_no_goals_is_refused_and_the_backend_is_closed(
+    fake_backend: str,
+    make: Any,
+    options: dict[str, Any],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closed: list[FakeBackend] = []
+    monkeypatch.setattr(FakeBackend, "close", lambda backend: closed.append(backend))
+    with pytest.raises(GymMaraError, match=message):
+        make(backend=fake_backend, **options)
+    assert len(closed) == 1

@@ -530,6 +530,17 @@ def test_invalid_options_are_refused(
 
 
 @pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
+def test_a_start_in_collision_gives_a_warning_once(make: Callable[..., Any]) -> None:
+    env = make(max_joint_velocity=1.57, start_q=COLLIDING_Q)
+    with pytest.warns(
+        UserWarning, match="start_q .* in collision.*: motor4_link, motor5_link, table"
+    ):
+        env.reset(seed=0)
+    env.reset()
+    make(collision="none", start_q=COLLIDING_Q).reset()
+
+
+@pytest.mark.parametrize("make", [MaraEnv, MaraVectorEnv])
 def test_a_target_out_of_reach_gives_a_warning_and_works(
     make: Callable[..., MaraEnv | MaraVectorEnv],
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,7 @@ from gym_mara.envs.statistics import EpisodeStatistics
 from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel
 from gym_mara.testing import COLLIDING_Q, COPIES, pickled
+from tests.backends.fake import FakeBackend
 from tests.helpers import ENV_IDS, TASK_NAMES, Floats, robot_model
 
 MODES = ("NextStep", "SameStep")
@@ -213,6 +215,20 @@ def test_next_step_resets_in_the_next_step_and_ignores_its_action() -> None:
     for result in (reward, terminated, truncated):
         assert not result.any()
     assert not info["_distance"].any()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_no_arm_is_moved_in_the_step_in_which_all_begin_their_next_episodes(
+    fake_backend: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = MaraVectorEnv(count, backend=fake_backend, max_episode_steps=1)
+    env.reset()
+    infos = env.step(np.full((count, 6), 0.1))[4]
+    with monkeypatch.context() as context:
+        context.delattr(FakeBackend, "step")
+        info = env.step(np.full((count, 6), np.nan))[4]
+    assert info.keys() == infos.keys() - {"statistics", "_statistics"}
+    assert env.step(np.full((count, 6), 0.1))[3].all()
 
 
 def test_same_step_returns_the_first_observation_and_the_final_one_in_info() -> None:
@@ -420,6 +436,17 @@ def test_the_error_for_an_unknown_autoreset_mode_lists_the_valid_ones() -> None:
         MaraVectorEnv(1, autoreset_mode="Never")
 
 
+def test_a_wrong_argument_is_found_before_a_backend_is_made(
+    fake_backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr(FakeBackend, "__init__", lambda self, *_, **__: made.append(self))
+    for wrong in ({"autoreset_mode": "Never"}, {"max_episode_steps": 0}, {"render_mode": "x"}):
+        with pytest.raises(GymMaraError, match=next(iter(wrong))):
+            MaraVectorEnv(1, backend=fake_backend, **wrong)
+    assert not made
+
+
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
@@ -438,6 +465,14 @@ def test_invalid_actions_move_no_arm(actions: Floats, message: str) -> None:
     with pytest.raises(GymMaraError, match=message):
         env.step(actions)
     assert str(env.save_state()["backend"]) == before
+
+
+@pytest.mark.parametrize("shape", [(6,), (2, 6)])
+def test_the_error_for_a_shape_names_the_whole_shape_also_for_one_arm(shape: Any) -> None:
+    env = MaraVectorEnv(1)
+    env.reset()
+    with pytest.raises(GymMaraError, match=re.escape(f"shape {shape}; mara needs (1, 6)")):
+        env.step(np.zeros(shape))
 
 
 def test_a_collision_of_one_arm_does_not_affect_the_others() -> None:

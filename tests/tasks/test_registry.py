@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from gym_mara import register_task
 from gym_mara.envs import MaraGoalVectorEnv, MaraVectorEnv, make_vector_env
 from gym_mara.errors import GymMaraError
-from gym_mara.registration import environment, environment_id, environment_names
+from gym_mara.registration import ENVIRONMENTS, environment, environment_id, environment_names
 from gym_mara.tasks import TASKS, ReachTask, named_task, task_names
 from gym_mara.tasks.registry import BrokenTaskError
 
@@ -162,6 +163,46 @@ def test_a_name_can_only_have_one_task() -> None:
         register_task("MARA-v0", ReachTask(alpha=9.0))
 
 
+@pytest.fixture
+def registered() -> Iterator[None]:
+    """What a test registers is forgotten after it."""
+    registries: list[dict[str, Any]] = [TASKS, ENVIRONMENTS, gymnasium.registry]
+    kept = [dict(each) for each in registries]
+    yield
+    for registry, before in zip(registries, kept, strict=True):
+        registry.clear()
+        registry.update(before)
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_cell_that_defines_and_registers_a_task_can_run_again() -> None:
+    def cell(kappa: float) -> None:
+        class Own(ReachTask):
+            """A notebook's task."""
+
+        register_task("notebook/Own-v0", Own(kappa=kappa))
+
+    cell(0.02)
+    with pytest.warns(UserWarning, match="Overriding environment notebook/Own-v0"):
+        cell(0.03)
+    task = make_vector_env("notebook/Own-v0", 1).simulation.task
+    assert MaraVectorEnv(1, task).max_episode_steps == task.episode_steps
+    assert isinstance(task, ReachTask)
+    assert task.kappa == 0.03
+    with pytest.raises(GymMaraError, match="another task has the name 'notebook/Own-v0'"):
+        register_task("notebook/Own-v0", ReachTask())
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_name_can_be_registered_with_the_namespace_of_this_package() -> None:
+    register_task("gym_mara/Own-v0", ReachTask(kappa=0.03))
+    assert gymnasium.spec("gym_mara/Own-v0")
+    for name in ("Own-v0", "gym_mara/Own-v0"):
+        assert make_vector_env(name, 1).simulation.task == ReachTask(kappa=0.03)
+    with pytest.raises(GymMaraError, match="another task has the name 'MARA-v0'"):
+        register_task("gym_mara/MARA-v0", ReachTask(alpha=9.0))
+
+
 # The environments by name.
 
 
@@ -172,5 +213,7 @@ def test_a_vector_environment_is_made_by_its_name(name: str, form: str) -> None:
     assert type(envs) is (MaraGoalVectorEnv if name == "MARAGoal-v0" else MaraVectorEnv)
     own = gymnasium.spec(environment_id(name)).max_episode_steps
     assert envs.max_episode_steps == own
+    made = {"task": environment(name).task, **environment(name).keywords}
+    assert type(envs)(1, **made).max_episode_steps == own
     assert make_vector_env(name, 2, max_episode_steps=None).max_episode_steps is None
     assert environment_id(name) == f"gym_mara/{name}"

@@ -74,9 +74,15 @@ class Actions(ABC):
             GymMaraError: a setting does not fit the mode or the robot.
         """
 
-    def array(self, action: Any) -> NDArray[Any]:
-        """An action as an array of NumPy; see `gym_mara.envs.actions.checks.action_array`."""
-        return action_array(action, self.meaning, units=self.stepping)
+    def of_one_arm(self, action: Any) -> NDArray[Any]:
+        """An action (A,) as an array of NumPy for a batch of one arm (1, A).
+
+        Raises:
+            GymMaraError: it has another shape, or as in `gym_mara.envs.actions.checks.action_array`.
+        """
+        array = action_array(action, self.meaning, units=self.stepping)
+        self._check_shape(array, "action", self.action.shape[1:])
+        return array[None]
 
     @abstractmethod
     def targets(self, action: Any) -> Floats:
@@ -119,16 +125,18 @@ class Actions(ABC):
         xp, (low, high) = namespace(target), self._targets_range
         return xp.minimum(xp.maximum(target, low), high)
 
+    def _check_shape(self, array: Array, what: str, shape: tuple[int, ...]) -> None:
+        if array.shape != shape:
+            found, needed = tuple(array.shape), tuple(shape)
+            raise GymMaraError(f"the {what} has shape {found}; {self._robot.name} needs {needed}")
+
     def _checked(self, values: Any, what: str, shape: tuple[int, ...]) -> Floats:
         if self._tensors:
             array: Array = action_tensor(values, self.meaning, self._like)
         else:
             array = action_array(values, self.meaning, units=self.stepping)
             array = array.astype(np.float64, copy=False)
-        if array.shape != shape:
-            own = slice(1 if shape[0] == 1 else 0, None)
-            found, needed = (tuple(size)[own] for size in (array.shape, shape))
-            raise GymMaraError(f"the {what} has shape {found}; {self._robot.name} needs {needed}")
+        self._check_shape(array, what, shape)
         xp = namespace(array)
         if xp.count_nonzero(xp.isfinite(array)) < shape[0] * shape[1]:
             raise GymMaraError(

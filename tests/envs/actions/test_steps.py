@@ -211,7 +211,7 @@ def test_settings_that_do_not_fit_are_refused(options: dict[str, Any], message: 
     ("action", "message"),
     [
         (np.full((1, 6), np.nan), r"the action contains NaN or infinity; .*in \[-1, 1\]"),
-        (np.zeros((1, 5)), r"the action has shape \(5,\); mara needs \(6,\)"),
+        (np.zeros((1, 5)), r"the action has shape \(1, 5\); mara needs \(1, 6\)"),
         (np.full((1, 6), "a"), "integers or floats .*not of <U1"),
     ],
 )
