@@ -78,7 +78,10 @@ def train(
 
 
 def preset_of(config: RunConfig) -> Preset:
-    """The preset that a configuration names, for the task and the backend of its environment.
+    """The preset that a configuration names, for the task, the backend and the actions of its environment.
+
+    The one for joints that teleport is chosen only if they do so and an action is a joint target. With another action the next
+    state depends on the state before, too, and joints seem to travel.
 
     Raises:
         GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
@@ -87,9 +90,8 @@ def preset_of(config: RunConfig) -> Preset:
     env = make_env(config.env, config.backend, 1, config.env_options)
     try:
         simulation = env.env.simulation
-        return presets.choose(
-            teleports=simulation.backend.teleports, family=simulation.task.preset_family
-        )
+        teleports = simulation.backend.teleports and simulation.actions.mode == "absolute"
+        return presets.choose(teleports=teleports, family=simulation.task.preset_family)
     finally:
         env.close()
 
