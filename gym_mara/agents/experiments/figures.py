@@ -28,6 +28,7 @@ from gym_mara.types import Floats
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
     "position error, mm": (("last", "position_error_mm"), 4),
     "angle, deg": (("last", "angle_deg"), 2),
+    "success, %": (("last", "success_percent"), 1),
     "reward per step": (("last", "reward_per_step"), 2),
     "collisions": (("last", "collisions"), 0),
     "position error of the best, mm": (("best", "position_error_mm"), 4),
@@ -35,6 +36,8 @@ COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
     "steps to 10 mm": (("steps_to_10_mm",), 0),
     "wall time, s": (("seconds",), 0),
 }
+_OPTIONAL = "success, %"
+"""The column that only tables with a task that reports `success` have."""
 _TRAINING, _EVALUATION = "rollout/reward_per_step", "eval/reward_per_step"
 _POINTS = 200
 _BEST = 10.0 * MAX_EPISODE_STEPS
@@ -256,21 +259,29 @@ def _value(result: Result, path: tuple[str, ...]) -> float:
     return float("inf") if value is None else float(value)
 
 
+def _columns(rows: list[dict[str, Any]]) -> list[str]:
+    """The columns of a table with these rows."""
+    measured = any(np.isfinite(row[_OPTIONAL][0].mean) for row in rows)
+    return [title for title in COLUMNS if measured or title != _OPTIONAL]
+
+
 def _write_table(file: Path, rows: list[dict[str, Any]]) -> Path:
-    titles = [f"{title}, {part}" for title in COLUMNS for part in ("iqm", "low", "high")]
+    columns = _columns(rows)
+    titles = [f"{title}, {part}" for title in columns for part in ("iqm", "low", "high")]
     table: list[list[Any]] = [["environment", "algorithm", "seeds", *titles]]
     for row in rows:
-        cells = [f"{v:.6g}" for title in COLUMNS for v in asdict(row[title][0]).values()]
+        cells = [f"{v:.6g}" for title in columns for v in asdict(row[title][0]).values()]
         table.append([row["environment"], row["algorithm"], row["seeds"], *cells])
     return _write_csv(file, table)
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:
-    titles = ["environment", "algorithm", "seeds", *COLUMNS]
+    columns = _columns(rows)
+    titles = ["environment", "algorithm", "seeds", *columns]
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for row in rows:
         cells = [row["environment"], row["algorithm"].upper(), str(row["seeds"])]
-        cells += [format_interval(*row[title]) for title in COLUMNS]
+        cells += [format_interval(*row[title]) for title in columns]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

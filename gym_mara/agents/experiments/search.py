@@ -19,9 +19,9 @@ from optuna.storages.journal import JournalFileBackend
 from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, Values, is_schedule
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
-from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS
+from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS, RANDOM_EPISODES
 from gym_mara.agents.experiments.local_executor import run_in_processes
-from gym_mara.agents.runs.evaluation import evaluate_run
+from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
 from gym_mara.backends import DEFAULT_BACKEND
@@ -200,6 +200,7 @@ def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
     """Train the runs of a trial; the mean shortfall of their last policies."""
     preset = _suggested(search, trial)
+    episodes = episodes_to_judge(search.config(FIRST_SEED), RANDOM_EPISODES)
     shortfalls: list[float] = []
     reported = 0
 
@@ -221,7 +222,7 @@ def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
                 run = train(config, Path(folder) / "run", on_progress, preset=preset)
             except TrainingDivergedError as error:
                 raise optuna.TrialPruned(str(error)) from error
-            reward = float(evaluate_run(run, episodes=1)["reward_per_step"].mean())
+            reward = float(evaluate_run(run, episodes=episodes)["reward_per_step"].mean())
         shortfalls.append(_shortfall(reward))
     return float(np.mean(shortfalls))
 
