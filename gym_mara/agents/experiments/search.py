@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,7 +17,14 @@ import optuna
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, Values, is_schedule
+from gym_mara.agents.algorithms.base import (
+    LogRange,
+    Preset,
+    SearchSpace,
+    Values,
+    is_schedule,
+    policy_class,
+)
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
 from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS, RANDOM_EPISODES
@@ -103,7 +111,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         wanted = {name: value for name, value in asdict(search).items() if name != "trials"}
         existing = study.user_attrs.get("search")
         if existing is None:
-            study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
+            study.enqueue_trial(start_values(start, search.algo))
             study.set_user_attr("search", wanted)
         best_trial(study)  # reads all trials
     if existing not in (None, wanted):
@@ -248,7 +256,7 @@ def space_around(start: Preset, algo: str) -> SearchSpace:
     """
     entry = algorithm(algo)
     space = entry.search_space
-    there = values_of(start, space)
+    there, given = start_values(start, algo), values_of(start, space)
     usual = entry.preset(DEFAULT_PRESET, teleports=True).policy == start.policy
 
     def around(name: str, values: Values) -> Values:
@@ -264,7 +272,7 @@ def space_around(start: Preset, algo: str) -> SearchSpace:
 
     return SearchSpace(
         {name: around(name, values) for name, values in space.arguments.items()},
-        {n: around(n, v) for n, v in space.policy_kwargs.items() if usual or n in there},
+        {n: around(n, v) for n, v in space.policy_kwargs.items() if usual or n in given},
     )
 
 
@@ -288,6 +296,24 @@ def values_of(preset: Preset, space: SearchSpace) -> dict[str, Any]:
         name: given[name] for name in (*space.arguments, *space.policy_kwargs) if name in given
     }
     return {name: v[0][1] if is_schedule(v) else v for name, v in found.items()}
+
+
+def start_values(preset: Preset, algo: str) -> dict[str, Any]:
+    """The values with which a search starts: those of the preset, and what it leaves out as the algorithm and its network have it."""
+    space = algorithm(algo).search_space
+    found = values_of(preset, space)
+    for make, varied in (
+        (algorithm(algo).load_class(), space.arguments),
+        (policy_class(preset.policy), space.policy_kwargs),
+    ):
+        parameters = inspect.signature(make).parameters
+        for name in varied.keys() - found.keys() & parameters.keys():
+            value = parameters[name].default
+            if type(value) in (int, float) and (
+                value > 0 or not isinstance(varied[name], LogRange)
+            ):
+                found[name] = value
+    return found
 
 
 def _shortfall(reward_per_step: float) -> float:

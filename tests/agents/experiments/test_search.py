@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
 from dataclasses import replace
@@ -188,6 +189,9 @@ def test_a_search_starts_with_the_preset_of_the_environment(
     first, second = tried
     space, preset = algorithm(algo).search_space, preset_of(search.config(FIRST_SEED))
     assert values_of(first, space).items() >= values_of(preset, space).items()
+    defaults = inspect.signature(algorithm(algo).load_class()).parameters
+    for name in space.arguments.keys() - preset.arguments.keys():
+        assert first.arguments[name] == defaults[name].default
     assert second != first
 
 
