@@ -108,6 +108,17 @@ def environment(name: str) -> Environment:
     return ENVIRONMENTS[own]
 
 
+def own_backend(name: str) -> str:
+    """The backend of the environment with this name, unless a user gives another.
+
+    Raises:
+        GymMaraError: the name is unknown, or the task of another package cannot be loaded.
+    """
+    from gym_mara.backends import DEFAULT_BACKEND  # `import gym_mara` imports no backend
+
+    return str(environment(name).keywords.get("backend", DEFAULT_BACKEND))
+
+
 def environment_name(name: str) -> str:
     """The name of an environment, given with or without the module and the namespace of its id.
 

@@ -29,10 +29,10 @@ from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
 from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS, RANDOM_EPISODES
 from gym_mara.agents.experiments.local_executor import run_in_processes
+from gym_mara.agents.runs.config import check_backend
 from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError, short, unknown, whole_number
 from gym_mara.files import (
     BusyError,
@@ -43,7 +43,7 @@ from gym_mara.files import (
     writing,
     written_aside,
 )
-from gym_mara.registration import environment_names
+from gym_mara.registration import environment_names, own_backend
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
@@ -71,15 +71,16 @@ class Search:
         if self.env not in environment_names():
             raise unknown("environment", self.env, environment_names())
         algorithm(self.algo)
+        check_backend(own_backend(self.env))
         for name, most in (("steps", MOST_STEPS), ("trials", MOST_TRIALS), ("seeds", MOST_SEEDS)):
             if whole_number(name, value := getattr(self, name)) > most:
                 raise GymMaraError(f"{name} must be at most {most:,}, not {short(value)}")
 
     def config(self, seed: int) -> RunConfig:
-        """The configuration of one run, on the default backend."""
+        """The configuration of one run, on the backend of the environment."""
         every = max(1, self.steps // _EVALUATIONS)
         return RunConfig(
-            self.env, self.algo, DEFAULT_BACKEND, self.steps, seed, checkpoint_every=every
+            self.env, self.algo, own_backend(self.env), self.steps, seed, checkpoint_every=every
         )
 
 
