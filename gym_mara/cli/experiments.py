@@ -192,7 +192,10 @@ def search(
 
     def show_best() -> None:
         best = module.best_trial(study)
-        text = f"best: {best.value:.3f} {json.dumps(best.params)}" if best else "none finished yet"
+        text = "none finished yet"
+        if best is not None and best.value is not None:
+            reward = module.reward_of(best.value)
+            text = f"best: {reward:.6g} per step, with {json.dumps(best.params)}"
         out.print(f"{module.finished_trials(study)} of {trials} trials, {text}", soft_wrap=True)
 
     def on_message(name: str, message: Any) -> None:

@@ -318,5 +318,10 @@ def start_values(preset: Preset, algo: str) -> dict[str, Any]:
 
 
 def _shortfall(reward_per_step: float) -> float:
-    """log₁₀ of how far a reward per step is below 10, the highest; a search minimises it."""
+    """log₁₀ of how far a reward per step is below 10, the highest of the paper's tasks; a search minimises it."""
     return math.log10(max(10.0 - reward_per_step, 1e-9))
+
+
+def reward_of(value: float) -> float:
+    """The reward per step of a trial with this value."""
+    return 10.0 - 10.0**value

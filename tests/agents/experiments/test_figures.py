@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from gym_mara.agents.evaluation.metrics import METRICS
+from gym_mara.agents.experiments import figures
 from gym_mara.agents.experiments import grid as grid_module
 from gym_mara.agents.experiments.figures import _markdown, _rows, _scale, plot_grid
 from gym_mara.agents.experiments.grid import Grid, Metrics, open_grid, read_result, valid_result
@@ -193,6 +196,25 @@ def test_curves_close_to_the_best_are_far_apart_in_the_figure() -> None:
     )[:, 1]
     assert 0.4 < low < high - 0.1
     assert high < top
+
+
+@pytest.mark.parametrize(
+    ("env", "label"),
+    [("MARA-v0", "mean episode reward"), ("MARAReach-v0", "mean reward per step in training")],
+)
+def test_only_the_figures_of_the_paper_show_whole_episodes(
+    env: str, label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    monkeypatch.setattr(figures, "written_aside", lambda file: contextlib.nullcontext(file))
+    rows = [{"time/total_timesteps": 4096.0, "rollout/reward_per_step": -0.1}]
+    grid = replace(GRID, envs=(env,))
+    figures._draw(tmp_path / "x.png", grid, env, ["ppo"], {f"{env}_ppo_0": rows})
+    (axis,) = drawn[-1].axes
+    assert axis.get_ylabel().startswith(label)
+    factor = 2048.0 if env == "MARA-v0" else 1.0
+    np.testing.assert_allclose(np.asarray(axis.lines[0].get_ydata()), -0.1 * factor)
 
 
 def test_curves_far_from_the_best_fill_the_figure() -> None:
