@@ -9,7 +9,7 @@ from gymnasium.envs.registration import register
 
 from gym_mara.errors import GymMaraError, unknown, whole_number
 from gym_mara.tasks.base import MAX_EPISODE_STEPS, Task
-from gym_mara.tasks.registry import TASKS, named_task, task_names
+from gym_mara.tasks.registry import PAPER_TASKS, TASKS, named_task, task_names
 
 _NAMESPACE = "gym_mara"
 
@@ -119,6 +119,26 @@ def environment(name: str) -> Environment:
         task = named_task(own)  # imports the other package, which may register it
         return ENVIRONMENTS.get(own) or Environment(own, task.episode_steps)
     return ENVIRONMENTS[own]
+
+
+def is_of_paper(name: str) -> bool:
+    """Whether the environment with this name has one of the paper's four tasks, whose highest reward is 10 per step.
+
+    Raises:
+        GymMaraError: the name is unknown, or the task of another package cannot be loaded.
+    """
+    return environment(name).task in PAPER_TASKS
+
+
+def own_backend(name: str) -> str:
+    """The backend of the environment with this name, unless a user gives another.
+
+    Raises:
+        GymMaraError: the name is unknown, or the task of another package cannot be loaded.
+    """
+    from gym_mara.backends import DEFAULT_BACKEND  # `import gym_mara` imports no backend
+
+    return str(environment(name).keywords.get("backend", DEFAULT_BACKEND))
 
 
 def environment_name(name: str) -> str:

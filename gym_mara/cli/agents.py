@@ -11,7 +11,6 @@ import typer
 from rich import box
 from rich.table import Column, Table
 
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
     RunBackendOption,
@@ -31,6 +30,7 @@ from gym_mara.cli.common import (
 from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
 from gym_mara.deploy import OnnxPolicy
 from gym_mara.errors import GymMaraError
+from gym_mara.registration import own_backend
 from gym_mara.types import Floats
 
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
@@ -94,7 +94,7 @@ def evaluate(
     options = keyword_arguments(settings)
     if baseline is not None:
         refuse(context, "--baseline plays no run", "run", "policy")
-        backend, who = backend or DEFAULT_BACKEND, f"baseline {baseline}"
+        backend, who = backend or own_backend(env), f"baseline {baseline}"
         metrics = evaluate_baseline(
             baseline, env, backend=backend, episodes=episodes, seed=seed, options=options
         )

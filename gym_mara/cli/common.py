@@ -135,9 +135,13 @@ PresetOption = Annotated[
         help="Hyperparameters: " + " or ".join(preset_names()) + ".",
     ),
 ]
-BackendOption = Annotated[
-    str,
-    typer.Option(parser=backend_name, metavar="NAME", help="Backend; gym-mara list shows all."),
+OwnBackendOption = Annotated[
+    str | None,
+    typer.Option(
+        parser=backend_name,
+        metavar="NAME",
+        help="Backend; by default that of the environment. gym-mara list shows all.",
+    ),
 ]
 RunBackendOption = Annotated[
     str | None,

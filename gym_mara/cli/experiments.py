@@ -21,9 +21,9 @@ from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.backends.processes import cores
 from gym_mara.cli.common import (
     AlgoOption,
-    BackendOption,
     CheckpointOption,
     EnvOption,
+    OwnBackendOption,
     PresetOption,
     SeedsOption,
     StepsOption,
@@ -39,7 +39,7 @@ from gym_mara.cli.common import (
 )
 from gym_mara.errors import GymMaraError, unknown
 from gym_mara.files import read_text
-from gym_mara.registration import file_name
+from gym_mara.registration import file_name, own_backend
 from gym_mara.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def benchmark(
     seeds: SeedsOption = 3,
     steps: StepsOption = 1_000_000,
     preset: PresetOption = DEFAULT_PRESET,
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: OwnBackendOption = None,
     checkpoint_every: CheckpointOption = 50_000,
     jobs: JobsOption = None,
     executor: Annotated[
@@ -107,14 +107,18 @@ def benchmark(
     with needs_agents():
         from gym_mara.agents.experiments.figures import plot_grid
         from gym_mara.agents.experiments.grid import Grid, open_grid, run_grid
+        from gym_mara.agents.runs.config import check_backend
 
+    if backend is None:
+        for name in names_in("--env", env):
+            check_backend(own_backend(name))
     grid = Grid(
         envs=names_in("--env", env),
         algos=names_in("--algo", algo) if algo else _paper_algorithms(preset),
         seeds=seeds,
         steps=steps,
         preset_name=preset,
-        backend=backend,
+        backend=backend or DEFAULT_BACKEND,
         checkpoint_every=checkpoint_every,
     )
     run_jobs = _executor(executor, jobs, address)
@@ -188,7 +192,10 @@ def search(
 
     def show_best() -> None:
         best = module.best_trial(study)
-        text = f"best: {best.value:.3f} {json.dumps(best.params)}" if best else "none finished yet"
+        text = "none finished yet"
+        if best is not None and best.value is not None:
+            reward = module.reward_of(best.value)
+            text = f"best: {reward:.6g} per step, with {json.dumps(best.params)}"
         out.print(f"{module.finished_trials(study)} of {trials} trials, {text}", soft_wrap=True)
 
     def on_message(name: str, message: Any) -> None:

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from gym_mara.backends import backend_settings
 from gym_mara.cli.common import (
-    SetOption,
     backend_name,
     err,
     keyword_arguments,
@@ -20,7 +20,7 @@ from gym_mara.cli.common import (
     several,
 )
 from gym_mara.cli.ros2.options import CommandTopicOption, StateTopicOption
-from gym_mara.errors import GymMaraError
+from gym_mara.errors import GymMaraError, unknown
 from gym_mara.files import write_json
 from gym_mara.identification.fit import identify as fit
 from gym_mara.identification.identified import Identified
@@ -59,7 +59,14 @@ def identify(
     ] = 0.02,
     command_topic: CommandTopicOption = None,
     state_topic: StateTopicOption = None,
-    settings: SetOption = [],  # noqa: B006 - Typer reads it and never changes it
+    settings: Annotated[
+        list[str],
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Keyword argument of the backend, as JSON: --set physics_step=0.002.",
+        ),
+    ] = [],  # noqa: B006 - Typer reads it and never changes it
 ) -> None:
     """Find the delay, servo gains, effort limits and friction with which a backend follows a real arm best.
 
@@ -69,11 +76,18 @@ def identify(
 
     if out_file is not None and out_file.exists():
         raise GymMaraError(f"{str(out_file)!r} exists and is not overwritten: delete it first")
+    options = keyword_arguments(settings)
+    for name in options:
+        if name not in (valid := backend_settings(backend)):
+            hint = " Give --robot instead." if name == "robot" else ""
+            raise GymMaraError(
+                f"{unknown('keyword argument', name, valid, f' of the backend {backend!r}')}{hint}"
+            )
     arm = RobotModel.load(robot)
     log = read_log(bag, arm, period, states=state_topic or STATES, commands=command_topic)
     err.print(f"{log.duration:.1f} s of {arm.name}; this takes some minutes", highlight=False)
     chosen = names_in("--parameters", parameters)
-    found = fit(log, arm, backend, chosen, **keyword_arguments(settings))
+    found = fit(log, arm, backend, chosen, **options)
     _print(found)
     if out_file is not None:
         write_json(out_file, found.to_json(), new=True)

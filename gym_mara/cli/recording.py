@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import typer
 
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
     RunBackendOption,
@@ -27,6 +26,7 @@ from gym_mara.datasets.contents import LOWEST_PIXELS, MOST_PIXELS, checked_pixel
 from gym_mara.datasets.formats import FORMATS, writer_class
 from gym_mara.errors import GymMaraError
 from gym_mara.pretrained import pretrained_file
+from gym_mara.registration import own_backend
 
 IK, HAND = "ik", "hand"
 
@@ -93,7 +93,7 @@ def record(
         if by_hand:
             from gym_mara.datasets.hand import record_by_hand
 
-            name, chosen = env, backend or DEFAULT_BACKEND
+            name, chosen = env, backend or own_backend(env)
             made = record_by_hand(name, chosen, options, format, out_folder, **common, log=_print)
         else:
             with needs_agents():
@@ -120,7 +120,7 @@ def _source(
     from gym_mara.datasets import sources
 
     if policy == IK:
-        return sources.baseline(IK, env, backend or DEFAULT_BACKEND, options)
+        return sources.baseline(IK, env, backend or own_backend(env), options)
     if policy == PRETRAINED or policy.endswith(ONNX):
         file = pretrained_file(env) if policy == PRETRAINED else Path(policy)
         name = env if is_given(context, "env") or policy == PRETRAINED else None

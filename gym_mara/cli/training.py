@@ -13,13 +13,12 @@ import typer
 
 from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
 from gym_mara.agents.training import DEFAULT_LOGGERS, LOGGERS
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.agents import print_metrics
 from gym_mara.cli.common import (
     AlgoOption,
-    BackendOption,
     CheckpointOption,
     EnvOption,
+    OwnBackendOption,
     PresetOption,
     SetOption,
     StepsOption,
@@ -36,7 +35,7 @@ from gym_mara.cli.common import (
 )
 from gym_mara.cli.policies import PolicyOption
 from gym_mara.errors import GymMaraError
-from gym_mara.registration import file_name
+from gym_mara.registration import file_name, own_backend
 
 if TYPE_CHECKING:
     from gym_mara.agents.runs.folder import RunConfig
@@ -46,7 +45,7 @@ def train(
     context: typer.Context,
     env: EnvOption = "MARA-v0",
     algo: AlgoOption = DEFAULT_ALGORITHM,
-    backend: BackendOption = DEFAULT_BACKEND,
+    backend: OwnBackendOption = None,
     steps: StepsOption = 1_000_000,
     seed: Annotated[
         int,
@@ -112,6 +111,7 @@ def train(
         numbers = {"steps": steps, "seed": seed, "checkpoint_every": checkpoint_every}
         if start is None:
             refuse(context, "without --from it has no effect", "from_policy")
+            chosen["backend"] = backend or own_backend(env)
             config = RunConfig(**chosen, **numbers, env_options=options)  # type: ignore[arg-type]
         else:
             given = {k: v for k, v in chosen.items() if is_given(context, k.removesuffix("_name"))}

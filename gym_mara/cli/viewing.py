@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.cli.common import (
     EnvOption,
     SetOption,
@@ -26,6 +25,7 @@ from gym_mara.cli.common import (
 )
 from gym_mara.cli.policies import AnyPolicyOption, PolicyOption, exported_file
 from gym_mara.errors import GymMaraError
+from gym_mara.registration import own_backend
 
 if TYPE_CHECKING:
     from gym_mara.agents.inspection.watch import Show
@@ -126,7 +126,7 @@ def watch(
 
             # A user who jogs the arm into the table should see it there, not reset to its start.
             keywords = {"on_collision": "continue", **options}
-            open_viewer(env, chosen[0] if chosen else DEFAULT_BACKEND, keywords, speed=speed)
+            open_viewer(env, chosen[0] if chosen else own_backend(env), keywords, speed=speed)
         else:
             with needs_agents():
                 from gym_mara.agents.inspection.watch import watch_run

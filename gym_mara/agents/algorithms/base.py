@@ -193,9 +193,9 @@ class Presets(NamedTuple):
     """The presets of one name, for the ways in which a backend moves the joints and for families of tasks."""
 
     teleporting: Preset
-    """For joints that are at their targets after one step."""
+    """For joints that are at their targets after one step, and actions that are joint targets."""
     travelling: Preset
-    """For joints that need several steps to reach their targets."""
+    """For joints that need several steps to reach their targets, and for other actions."""
     families: Mapping[str, Preset] = MappingProxyType({})
     """`Task.preset_family` → the preset for these tasks on every backend; the two above are for all other tasks."""
 

@@ -20,7 +20,7 @@ from gym_mara.agents.experiments.grid import Grid, Result, read_grid, read_resul
 from gym_mara.agents.runs.folder import DamagedRunError, read_progress
 from gym_mara.errors import GymMaraError
 from gym_mara.files import write_text, written_aside
-from gym_mara.registration import environment, file_name
+from gym_mara.registration import environment, file_name, is_of_paper
 from gym_mara.tasks import MAX_EPISODE_STEPS, named_task
 from gym_mara.types import Floats
 
@@ -28,6 +28,7 @@ from gym_mara.types import Floats
 COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
     "position error, mm": (("last", "position_error_mm"), 4),
     "angle, deg": (("last", "angle_deg"), 2),
+    "success, %": (("last", "success_percent"), 1),
     "reward per step": (("last", "reward_per_step"), 2),
     "collisions": (("last", "collisions"), 0),
     "position error of the best, mm": (("best", "position_error_mm"), 4),
@@ -35,10 +36,12 @@ COLUMNS: dict[str, tuple[tuple[str, ...], int]] = {
     "steps to 10 mm": (("steps_to_10_mm",), 0),
     "wall time, s": (("seconds",), 0),
 }
+_OPTIONAL = "success, %"
+"""The column that only tables with a task that reports `success` have."""
 _TRAINING, _EVALUATION = "rollout/reward_per_step", "eval/reward_per_step"
 _POINTS = 200
 _BEST = 10.0 * MAX_EPISODE_STEPS
-"""The highest reward of an episode."""
+"""The highest reward of an episode of the paper's tasks."""
 
 
 @dataclass(frozen=True)
@@ -125,18 +128,23 @@ def _draw(
     algos: Sequence[str],
     curves: dict[str, list[dict[str, float]]],
 ) -> Path:
-    """Mean episode reward against steps, a colour for each algorithm; one that is alone also has a line for each seed."""
+    """Mean reward against steps, of an episode for the paper's tasks and per step for others; a colour for each algorithm; one that is alone also has a line for each seed."""
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axis = figure.subplots()
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
     drawn = []
+    of_paper = is_of_paper(env)
+    factor = MAX_EPISODE_STEPS if of_paper else 1
     for algo in algos:
         names = [name for name, run in grid.runs().items() if (run.env, run.algo) == (env, algo)]
-        lines = [_episode_reward(curves[name], steps) for name in names if name in curves]
+        lines = [factor * _mean_reward(curves[name], steps) for name in names if name in curves]
         if lines:
             colour = f"C{grid.algos.index(algo)}"
             drawn.append(_draw_band(axis, steps, np.array(lines), algo, colour, len(algos) == 1))
-    axis.set_ylabel("mean episode reward in training" + _scale(axis, np.concatenate(drawn)))
+    if of_paper:
+        axis.set_ylabel("mean episode reward in training" + _scale(axis, np.concatenate(drawn)))
+    else:
+        axis.set_ylabel("mean reward per step in training")
     axis.set_xlabel("environment steps")
     axis.set_title(f"{env}, {grid.preset_name} presets, {grid.backend}")
     axis.legend(loc="best")
@@ -190,8 +198,8 @@ def _scale(axis: Axes, shown: Floats) -> str:
     return f",\nlogarithmic in the distance from {_BEST:,.0f}, the best"
 
 
-def _episode_reward(rows: list[dict[str, float]], steps: Floats) -> Floats:
-    """The reward of a whole episode at these numbers of steps, from the mean reward per step since the number before."""
+def _mean_reward(rows: list[dict[str, float]], steps: Floats) -> Floats:
+    """The mean reward per step since the number before, at these numbers of steps."""
     points = [(r["time/total_timesteps"], r[_TRAINING]) for r in rows if _TRAINING in r]
     x, y = (np.array(column) for column in zip(*points, strict=True))
     part = np.searchsorted(steps, x).clip(max=len(steps) - 1)
@@ -199,7 +207,7 @@ def _episode_reward(rows: list[dict[str, float]], steps: Floats) -> Floats:
     mean = np.bincount(part, y, len(steps)) / np.maximum(count, 1)
     there = count > 0
     filled: Floats = np.interp(steps, steps[there], mean[there])
-    return MAX_EPISODE_STEPS * filled
+    return filled
 
 
 def _write_curves(file: Path, grid: Grid, curves: dict[str, list[dict[str, float]]]) -> Path:
@@ -210,8 +218,8 @@ def _write_curves(file: Path, grid: Grid, curves: dict[str, list[dict[str, float
     for name, run in grid.runs().items():
         rows = curves.get(name, [])
         start = [run.env, run.algo, run.seed]
-        for step, reward in zip(steps, _episode_reward(rows, steps) if rows else (), strict=False):
-            cells = [f"{int(step)}", f"{reward / MAX_EPISODE_STEPS:.4f}"]
+        for step, reward in zip(steps, _mean_reward(rows, steps) if rows else (), strict=False):
+            cells = [f"{int(step)}", f"{reward:.4f}"]
             table.append([*start, *cells, "", "", ""])
         for row in rows:
             if _EVALUATION in row:
@@ -256,21 +264,29 @@ def _value(result: Result, path: tuple[str, ...]) -> float:
     return float("inf") if value is None else float(value)
 
 
+def _columns(rows: list[dict[str, Any]]) -> list[str]:
+    """The columns of a table with these rows."""
+    measured = any(np.isfinite(row[_OPTIONAL][0].mean) for row in rows)
+    return [title for title in COLUMNS if measured or title != _OPTIONAL]
+
+
 def _write_table(file: Path, rows: list[dict[str, Any]]) -> Path:
-    titles = [f"{title}, {part}" for title in COLUMNS for part in ("iqm", "low", "high")]
+    columns = _columns(rows)
+    titles = [f"{title}, {part}" for title in columns for part in ("iqm", "low", "high")]
     table: list[list[Any]] = [["environment", "algorithm", "seeds", *titles]]
     for row in rows:
-        cells = [f"{v:.6g}" for title in COLUMNS for v in asdict(row[title][0]).values()]
+        cells = [f"{v:.6g}" for title in columns for v in asdict(row[title][0]).values()]
         table.append([row["environment"], row["algorithm"], row["seeds"], *cells])
     return _write_csv(file, table)
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:
-    titles = ["environment", "algorithm", "seeds", *COLUMNS]
+    columns = _columns(rows)
+    titles = ["environment", "algorithm", "seeds", *columns]
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for row in rows:
         cells = [row["environment"], row["algorithm"].upper(), str(row["seeds"])]
-        cells += [format_interval(*row[title]) for title in COLUMNS]
+        cells += [format_interval(*row[title]) for title in columns]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

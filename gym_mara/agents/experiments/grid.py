@@ -18,7 +18,7 @@ from typing_extensions import TypedDict
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import Executor, OnMessage, Send
 from gym_mara.agents.runs.config import check_backend
-from gym_mara.agents.runs.evaluation import evaluate_run
+from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
 from gym_mara.agents.runs.folder import (
     POLICIES,
     DamagedRunError,
@@ -45,6 +45,8 @@ PATIENCE = 30.0
 """How long to wait for another process that trains the same run, s; for example one whose parent was just killed."""
 REACHED = 10.0
 """A run has learnt to reach once its deterministic policy ends an episode within this distance of the target, mm."""
+RANDOM_EPISODES = 100
+"""How many episodes measure a finished run where they are random; where all are the same, it is one."""
 MOST_SEEDS, MOST_STEPS = 1000, 10**10
 _Name = Annotated[str, MaxLen(100)]
 _Length = Annotated[FiniteFloat, Ge(0.0)]
@@ -116,17 +118,20 @@ Metrics = TypedDict(
     {
         "position_error_mm": _Length | None,
         "angle_deg": _Length | None,
+        "success_percent": _Length | None,
         "reward_per_step": FiniteFloat,
         "return": FiniteFloat,
         "collisions": _Length,
     },
 )
-"""How a policy did; None for what its task does not measure."""
+"""The means over the episodes of a policy; None for what its task does not measure."""
 
 
 class Result(TypedDict):
     """The result of a finished run, the content of result.json."""
 
+    episodes: Annotated[int, Ge(1)]
+    """How many episodes measured each policy."""
     last: Metrics
     best: Metrics
     steps_to_10_mm: Annotated[int, Ge(0)] | None
@@ -246,7 +251,9 @@ def run_one(path: Path, config: RunConfig, send: Send) -> None:
         file = path / "result.json"
         if os.path.lexists(file) and valid_result(path) is None:
             renamed = _set_aside(file)
-            send(f"{file.name} is damaged; renamed to {renamed.name!r} and written again")
+            send(
+                f"{file.name} is damaged, or of an older version; renamed to {renamed.name!r} and written again"
+            )
         write_json(file, result)
         distance = result["last"]["position_error_mm"]
         send((config.steps, {} if distance is None else {"eval_position_error_mm": distance}))
@@ -290,16 +297,18 @@ def _result(run: RunFolder) -> Result:
             raise DamagedRunError(
                 f"the run {str(run.path)!r} is damaged: its {which!r} policy is missing"
             )
+    episodes = episodes_to_judge(run.config, RANDOM_EPISODES)
     return {
-        "last": _metrics(run, "last"),
-        "best": _metrics(run, "best"),
+        "episodes": episodes,
+        "last": _metrics(run, "last", episodes),
+        "best": _metrics(run, "best", episodes),
         "steps_to_10_mm": int(reached[0]) if reached else None,
         "seconds": float(run.seconds()),
     }
 
 
-def _metrics(run: RunFolder, which: str) -> Metrics:
-    measured = evaluate_run(run, episodes=1, which=which)
+def _metrics(run: RunFolder, which: str, episodes: int) -> Metrics:
+    measured = evaluate_run(run, episodes=episodes, which=which)
     means = {name: float(measured[name].mean()) for name in Metrics.__annotations__}
     metrics: Any = {name: value if math.isfinite(value) else None for name, value in means.items()}
     return cast("Metrics", metrics)

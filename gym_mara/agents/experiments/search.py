@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,15 +17,22 @@ import optuna
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from gym_mara.agents.algorithms.base import LogRange, Preset, SearchSpace, Values, is_schedule
+from gym_mara.agents.algorithms.base import (
+    LogRange,
+    Preset,
+    SearchSpace,
+    Values,
+    is_schedule,
+    policy_class,
+)
 from gym_mara.agents.algorithms.registry import DEFAULT_PRESET, algorithm
 from gym_mara.agents.experiments.executor import OnMessage, Send
-from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS
+from gym_mara.agents.experiments.grid import MOST_SEEDS, MOST_STEPS, RANDOM_EPISODES
 from gym_mara.agents.experiments.local_executor import run_in_processes
-from gym_mara.agents.runs.evaluation import evaluate_run
+from gym_mara.agents.runs.config import check_backend
+from gym_mara.agents.runs.evaluation import episodes_to_judge, evaluate_run
 from gym_mara.agents.runs.folder import RunConfig
 from gym_mara.agents.training.train import preset_of, train
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError, short, unknown, whole_number
 from gym_mara.files import (
     BusyError,
@@ -35,7 +43,7 @@ from gym_mara.files import (
     writing,
     written_aside,
 )
-from gym_mara.registration import environment_names
+from gym_mara.registration import environment_names, own_backend
 
 _State = optuna.trial.TrialState
 FIRST_SEED = 1_000_000
@@ -63,15 +71,16 @@ class Search:
         if self.env not in environment_names():
             raise unknown("environment", self.env, environment_names())
         algorithm(self.algo)
+        check_backend(own_backend(self.env))
         for name, most in (("steps", MOST_STEPS), ("trials", MOST_TRIALS), ("seeds", MOST_SEEDS)):
             if whole_number(name, value := getattr(self, name)) > most:
                 raise GymMaraError(f"{name} must be at most {most:,}, not {short(value)}")
 
     def config(self, seed: int) -> RunConfig:
-        """The configuration of one run, on the default backend."""
+        """The configuration of one run, on the backend of the environment."""
         every = max(1, self.steps // _EVALUATIONS)
         return RunConfig(
-            self.env, self.algo, DEFAULT_BACKEND, self.steps, seed, checkpoint_every=every
+            self.env, self.algo, own_backend(self.env), self.steps, seed, checkpoint_every=every
         )
 
 
@@ -103,7 +112,7 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
         wanted = {name: value for name, value in asdict(search).items() if name != "trials"}
         existing = study.user_attrs.get("search")
         if existing is None:
-            study.enqueue_trial(values_of(start, algorithm(search.algo).search_space))
+            study.enqueue_trial(start_values(start, search.algo))
             study.set_user_attr("search", wanted)
         best_trial(study)  # reads all trials
     if existing not in (None, wanted):
@@ -200,6 +209,7 @@ def best_trial(study: optuna.Study) -> optuna.trial.FrozenTrial | None:
 def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
     """Train the runs of a trial; the mean shortfall of their last policies."""
     preset = _suggested(search, trial)
+    episodes = episodes_to_judge(search.config(FIRST_SEED), RANDOM_EPISODES)
     shortfalls: list[float] = []
     reported = 0
 
@@ -221,7 +231,7 @@ def _value(search: Search, send: Send, trial: optuna.Trial) -> float:
                 run = train(config, Path(folder) / "run", on_progress, preset=preset)
             except TrainingDivergedError as error:
                 raise optuna.TrialPruned(str(error)) from error
-            reward = float(evaluate_run(run, episodes=1)["reward_per_step"].mean())
+            reward = float(evaluate_run(run, episodes=episodes)["reward_per_step"].mean())
         shortfalls.append(_shortfall(reward))
     return float(np.mean(shortfalls))
 
@@ -247,7 +257,7 @@ def space_around(start: Preset, algo: str) -> SearchSpace:
     """
     entry = algorithm(algo)
     space = entry.search_space
-    there = values_of(start, space)
+    there, given = start_values(start, algo), values_of(start, space)
     usual = entry.preset(DEFAULT_PRESET, teleports=True).policy == start.policy
 
     def around(name: str, values: Values) -> Values:
@@ -263,7 +273,7 @@ def space_around(start: Preset, algo: str) -> SearchSpace:
 
     return SearchSpace(
         {name: around(name, values) for name, values in space.arguments.items()},
-        {n: around(n, v) for n, v in space.policy_kwargs.items() if usual or n in there},
+        {n: around(n, v) for n, v in space.policy_kwargs.items() if usual or n in given},
     )
 
 
@@ -289,6 +299,29 @@ def values_of(preset: Preset, space: SearchSpace) -> dict[str, Any]:
     return {name: v[0][1] if is_schedule(v) else v for name, v in found.items()}
 
 
+def start_values(preset: Preset, algo: str) -> dict[str, Any]:
+    """The values with which a search starts: those of the preset, and what it leaves out as the algorithm and its network have it."""
+    space = algorithm(algo).search_space
+    found = values_of(preset, space)
+    for make, varied in (
+        (algorithm(algo).load_class(), space.arguments),
+        (policy_class(preset.policy), space.policy_kwargs),
+    ):
+        parameters = inspect.signature(make).parameters
+        for name in varied.keys() - found.keys() & parameters.keys():
+            value = parameters[name].default
+            if type(value) in (int, float) and (
+                value > 0 or not isinstance(varied[name], LogRange)
+            ):
+                found[name] = value
+    return found
+
+
 def _shortfall(reward_per_step: float) -> float:
-    """log₁₀ of how far a reward per step is below 10, the highest; a search minimises it."""
+    """log₁₀ of how far a reward per step is below 10, the highest of the paper's tasks; a search minimises it."""
     return math.log10(max(10.0 - reward_per_step, 1e-9))
+
+
+def reward_of(value: float) -> float:
+    """The reward per step of a trial with this value."""
+    return 10.0 - 10.0**value

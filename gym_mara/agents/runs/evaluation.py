@@ -59,11 +59,11 @@ def make_env(
     return MaraVecEnv(arms, unit_box(len(arms.simulation.action_space.low)))
 
 
-def episodes_to_judge(config: RunConfig) -> int:
-    """How many episodes judge a policy of this run: one where all are the same, else RANDOM_EPISODES."""
+def episodes_to_judge(config: RunConfig, if_random: int = RANDOM_EPISODES) -> int:
+    """How many episodes judge a policy of this run: one where all are the same, else `if_random`."""
     env = make_arms(config.env, config.backend, 1, config.env_options)
     try:
-        return RANDOM_EPISODES if env.simulation.random else 1
+        return if_random if env.simulation.random else 1
     finally:
         env.close()
 

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.files import written_aside
+from gym_mara.registration import is_of_paper
 
 
 def plot_learning_curve(run: RunFolder) -> Path:
@@ -22,7 +23,8 @@ def plot_learning_curve(run: RunFolder) -> Path:
 
     draw(reward, "rollout/reward_per_step", "training", "C0-")
     draw(reward, "eval/reward_per_step", "deterministic policy", "C1o-")
-    reward.axhline(10.0, color="grey", linewidth=0.8, linestyle=":")
+    if is_of_paper(run.config.env):
+        reward.axhline(10.0, color="grey", linewidth=0.8, linestyle=":")
     reward.set_ylabel("reward per step")
     reward.legend(loc="best")
     draw(error, "eval/position_error_mm", "deterministic policy, last step", "C1o-")

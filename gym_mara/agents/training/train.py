@@ -34,9 +34,9 @@ from gym_mara.agents.training.checkpoint import Progress, restore_state
 from gym_mara.agents.training.loggers import check_loggers, make_writers
 from gym_mara.agents.training.replay import hindsight
 from gym_mara.agents.training.warm_start import begin_with
-from gym_mara.backends import DEFAULT_BACKEND
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from gym_mara.files import DamagedFileError, locked, refuse_links
+from gym_mara.registration import own_backend
 
 
 def train(
@@ -78,7 +78,10 @@ def train(
 
 
 def preset_of(config: RunConfig) -> Preset:
-    """The preset that a configuration names, for the task and the backend of its environment.
+    """The preset that a configuration names, for the task, the backend and the actions of its environment.
+
+    The one for joints that teleport is chosen only if they do so and an action is a joint target. With another action the next
+    state depends on the state before, too, and joints seem to travel.
 
     Raises:
         GymMaraError: the algorithm, the preset, or a part of the environment is unknown.
@@ -87,9 +90,8 @@ def preset_of(config: RunConfig) -> Preset:
     env = make_env(config.env, config.backend, 1, config.env_options)
     try:
         simulation = env.env.simulation
-        return presets.choose(
-            teleports=simulation.backend.teleports, family=simulation.task.preset_family
-        )
+        teleports = simulation.backend.teleports and simulation.actions.mode == "absolute"
+        return presets.choose(teleports=teleports, family=simulation.task.preset_family)
     finally:
         env.close()
 
@@ -168,7 +170,7 @@ def preset_agent(
     algo: str = DEFAULT_ALGORITHM,
     *,
     preset: str = DEFAULT_PRESET,
-    backend: str = DEFAULT_BACKEND,
+    backend: str | None = None,
     seed: int = 0,
     **options: Any,
 ) -> BaseAlgorithm:
@@ -178,7 +180,7 @@ def preset_agent(
         task: the name of a task.
         algo: the name of an algorithm.
         preset: the name of a preset.
-        backend: the name of a backend.
+        backend: the name of a backend; by default that of the environment.
         seed: of the policy, the sampling and the environment.
         **options: keyword arguments of the environment.
 
@@ -191,12 +193,13 @@ def preset_agent(
     config = RunConfig(
         env=task,
         algo=algo,
-        backend=backend,
+        backend=backend or own_backend(task),
         steps=1,  # not used: the caller calls `learn`
         seed=seed,
         env_options=options,
         preset_name=preset,
     )
+    check_backend(config.backend)
     return new_model(replace(config, preset=asdict(preset_of(config))))
 
 

@@ -159,6 +159,14 @@ def test_a_family_of_tasks_has_its_own_preset_on_every_backend(
     assert preset_of(config(env_options=options)) in presets[:2]
 
 
+@pytest.mark.parametrize("action", ["absolute", "relative", "cartesian"])
+def test_only_joint_targets_get_the_preset_of_joints_that_teleport(action: str) -> None:
+    teleporting, travelling, _ = algorithm("ppo").presets["tuned"]
+    chosen = preset_of(config(algo="ppo", env_options={"action": action}))
+    assert chosen is (teleporting if action == "absolute" else travelling)
+    assert preset_of(config(algo="ppo", env="MARAReach-v0")).arguments["gamma"] > 0.0
+
+
 @pytest.mark.usefixtures("a2c")
 def test_a_family_without_its_own_preset_has_that_of_the_backend(
     monkeypatch: pytest.MonkeyPatch,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +14,29 @@ import pytest
 from matplotlib.figure import Figure
 
 from gym_mara.agents.evaluation.metrics import METRICS
-from gym_mara.agents.experiments.figures import _scale, plot_grid
+from gym_mara.agents.experiments import figures
+from gym_mara.agents.experiments import grid as grid_module
+from gym_mara.agents.experiments.figures import _markdown, _rows, _scale, plot_grid
 from gym_mara.agents.experiments.grid import Grid, Metrics, open_grid, read_result, valid_result
+from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.errors import GymMaraError
 
 GRID = Grid(envs=("MARA-v0",), algos=("ppo", "acktr"), seeds=1, steps=4096)
 POLICY = {
     "position_error_mm": 1.0,
     "angle_deg": 2.0,
+    "success_percent": None,
     "reward_per_step": 9.0,
     "return": 100.0,
     "collisions": 0.0,
 }
-RESULT: dict[str, Any] = {"last": POLICY, "best": POLICY, "steps_to_10_mm": None, "seconds": 3}
+RESULT: dict[str, Any] = {
+    "episodes": 1,
+    "last": POLICY,
+    "best": POLICY,
+    "steps_to_10_mm": None,
+    "seconds": 3,
+}
 PROGRESS = "time/total_timesteps,rollout/reward_per_step\n2048,1.0\n4096,9.9\n"
 
 
@@ -94,6 +106,10 @@ def test_a_pipe_or_a_link_to_a_device_is_no_grid(tmp_path: Path) -> None:
         (json.dumps({**RESULT, "seconds": "0.001"}), "seconds: .*number, not '0.001'"),
         (json.dumps({**RESULT, "seconds": -1.0}), "seconds: .*greater"),
         (json.dumps({**RESULT, "last": {**POLICY, "return": float("nan")}}), "last.return"),
+        (
+            json.dumps({k: v for k, v in RESULT.items() if k != "episodes"}),
+            "episodes: Field required",
+        ),
         (json.dumps({**RESULT, "best": {}}), "best.position_error_mm: Field required"),
         (json.dumps({**RESULT, "steps_to_10_mm": 1.5}), "steps_to_10_mm"),
         (json.dumps(RESULT)[:-9], "JSON"),
@@ -124,6 +140,35 @@ def test_a_metric_that_a_task_does_not_measure_is_a_dash(folder: Path) -> None:
     assert "| MARA-v0 | PPO | 1 | - | - |" in (folder / "table.md").read_text()
 
 
+@pytest.mark.parametrize(("env", "episodes"), [("MARA-v0", 1), ("MARAReach-v0", 100)])
+def test_a_policy_is_measured_in_many_episodes_where_they_are_random(
+    env: str, episodes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[int] = []
+
+    def evaluate(run: RunFolder, *, episodes: int, which: str) -> dict[str, Any]:
+        played.append(episodes)
+        return {name: np.ones(episodes) for name in METRICS}
+
+    monkeypatch.setattr(grid_module, "evaluate_run", evaluate)
+    monkeypatch.setattr(RunFolder, "has_policy", lambda *_: True)
+    run = RunFolder(tmp_path, RunConfig(env, "ppo", "pinocchio", 4096, 0))
+    run.progress_file.write_text(PROGRESS)
+    assert grid_module._result(run)["episodes"] == episodes
+    assert played == [episodes, episodes]
+
+
+def test_the_success_is_a_column_where_a_task_reports_it() -> None:
+    def table_of(last: dict[str, Any]) -> str:
+        results: dict[str, Any] = {name: {**RESULT, "last": last} for name in GRID.runs()}
+        return _markdown(list(_rows(GRID, results)))
+
+    assert "success" not in table_of(POLICY)
+    table = table_of({**POLICY, "success_percent": 62.0}).splitlines()
+    column = table[0].split(" | ").index("success, %")
+    assert table[2].split(" | ")[column] == "62.0"
+
+
 def test_a_file_size_limit_leaves_the_old_figures(folder: Path, small_files: None) -> None:
     (folder / "MARA-v0.png").write_text("old")
     before = names(folder)
@@ -151,6 +196,25 @@ def test_curves_close_to_the_best_are_far_apart_in_the_figure() -> None:
     )[:, 1]
     assert 0.4 < low < high - 0.1
     assert high < top
+
+
+@pytest.mark.parametrize(
+    ("env", "label"),
+    [("MARA-v0", "mean episode reward"), ("MARAReach-v0", "mean reward per step in training")],
+)
+def test_only_the_figures_of_the_paper_show_whole_episodes(
+    env: str, label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    monkeypatch.setattr(figures, "written_aside", lambda file: contextlib.nullcontext(file))
+    rows = [{"time/total_timesteps": 4096.0, "rollout/reward_per_step": -0.1}]
+    grid = replace(GRID, envs=(env,))
+    figures._draw(tmp_path / "x.png", grid, env, ["ppo"], {f"{env}_ppo_0": rows})
+    (axis,) = drawn[-1].axes
+    assert axis.get_ylabel().startswith(label)
+    factor = 2048.0 if env == "MARA-v0" else 1.0
+    np.testing.assert_allclose(np.asarray(axis.lines[0].get_ydata()), -0.1 * factor)
 
 
 def test_curves_far_from_the_best_fill_the_figure() -> None:

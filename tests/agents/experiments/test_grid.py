@@ -102,7 +102,7 @@ def test_a_damaged_result_is_renamed_and_written_again(finished_grid: Path, tmp_
     assert run_grid(folder, GRID, in_this_process, lambda *sent: messages.append(sent)) == {}
     assert messages[0] == (
         name,
-        "result.json is damaged; renamed to 'result.json.damaged1' and written again",
+        "result.json is damaged, or of an older version; renamed to 'result.json.damaged1' and written again",
     )
     error = before["last"]["position_error_mm"]
     assert messages[1] == (name, (GRID.steps, {"eval_position_error_mm": error}))

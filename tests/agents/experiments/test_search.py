@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
 from dataclasses import replace
@@ -127,6 +128,22 @@ def test_a_bad_trial_is_pruned_whatever_the_length_of_its_rollouts(
     assert played[11] == 2, "it is compared from the third evaluation on"
 
 
+@pytest.mark.parametrize(("env", "episodes"), [("MARA-v0", 1), ("MARAReach-v0", 100)])
+def test_a_trial_is_judged_by_many_episodes_where_they_are_random(
+    env: str, episodes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[int] = []
+
+    def evaluate(run: Any, *, episodes: int) -> dict[str, Any]:
+        played.append(episodes)
+        return {"reward_per_step": np.ones(episodes)}
+
+    monkeypatch.setattr(module, "train", lambda *_, **__: None)
+    monkeypatch.setattr(module, "evaluate_run", evaluate)
+    run_trials(replace(SMALL, env=env, trials=1), tmp_path, ignore)
+    assert played == [episodes]
+
+
 @pytest.mark.slow
 def test_a_search_may_be_short(tmp_path: Path) -> None:
     short = Search(**{**vars(SMALL), "steps": 5, "trials": 1})
@@ -172,6 +189,9 @@ def test_a_search_starts_with_the_preset_of_the_environment(
     first, second = tried
     space, preset = algorithm(algo).search_space, preset_of(search.config(FIRST_SEED))
     assert values_of(first, space).items() >= values_of(preset, space).items()
+    defaults = inspect.signature(algorithm(algo).load_class()).parameters
+    for name in space.arguments.keys() - preset.arguments.keys():
+        assert first.arguments[name] == defaults[name].default
     assert second != first
 
 

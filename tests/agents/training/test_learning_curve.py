@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from gym_mara.agents.runs.folder import RunFolder
+from gym_mara.agents.training import learning_curve as module
 from gym_mara.agents.training.learning_curve import plot_learning_curve
 from gym_mara.errors import GymMaraError
 from tests.agents.conftest import config
@@ -27,6 +30,17 @@ def run(tmp_path: Path) -> RunFolder:
 
 def test_a_learning_curve_is_a_picture(run: RunFolder) -> None:
     assert plot_learning_curve(run).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("env", "lines"), [("MARA-v0", 3), ("MARAReach-v0", 2)])
+def test_only_the_tasks_of_the_paper_have_a_line_at_their_best_reward(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, env: str, lines: int
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    monkeypatch.setattr(module, "written_aside", contextlib.nullcontext)
+    plot_learning_curve(RunFolder(run.path, config(env=env)))
+    assert len(drawn[0].axes[0].lines) == lines
 
 
 def test_a_file_size_limit_leaves_the_old_picture(run: RunFolder, small_files: None) -> None:

@@ -42,7 +42,7 @@ from gym_mara.agents.training.train import preset_agent, preset_of, resume, trai
 from gym_mara.envs import MaraVectorEnv
 from gym_mara.errors import GymMaraError, TrainingDivergedError
 from tests.agents.conftest import EPISODE, ROLLOUT, config, silent
-from tests.helpers import started
+from tests.helpers import Cli, started
 
 
 def parameters(run: RunFolder, which: str = "last") -> dict[str, torch.Tensor]:
@@ -83,6 +83,22 @@ def test_a_run_writes_all_its_files(finished_run: RunFolder) -> None:
 def test_the_same_seed_trains_the_same_policy(finished_run: RunFolder, tmp_path: Path) -> None:
     again = train(config(), tmp_path / "run", silent)
     assert_same_training(finished_run, again)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", "--steps", "1"),
+        ("benchmark", "--seeds", "1", "--steps", "1"),
+        ("search", "--steps", "1"),
+    ],
+)
+def test_an_environment_of_a_real_arm_is_not_trained_on_another_backend(
+    command: tuple[str, ...], tmp_path: Path, gym_mara: Cli
+) -> None:
+    code, _, error = gym_mara(*command, "--env", "MARAReal-v0", "--out", tmp_path / "out")
+    assert (code, "no run can be trained on the backend 'ros2'" in error) == (2, True)
+    assert not (tmp_path / "out").exists()
 
 
 def test_random_episodes_are_judged_by_several(tmp_path: Path) -> None:
