@@ -107,7 +107,7 @@ class Clearance:
         xp, outer, slides, far, width = self._joints.like(frames.position)
         centre = self._placed(frames)
         spheres, _, count = centre.shape
-        least = [xp.zeros_like(centre[0, 0]) + far] * len(outer)
+        least = [xp.zeros_like(frames.position[:, 0]) + far] * len(outer)
         force = xp.zeros_like(centre)
         members = [self._of_pairs] if self._of_pairs else []
         groups = zip([*members, *self._of_boxes], self._groups(xp, centre), strict=True)
@@ -119,7 +119,9 @@ class Clearance:
         # The virtual work of the forces on all that a joint moves: their sum along its axis, or their moment about it.
         moment = xp.linalg.cross(centre, force, axis=1)
         total, turn = (
-            xp.permute_dims((outer @ each.reshape(spheres, -1)).reshape(-1, 3, count), (2, 0, 1))
+            xp.permute_dims(
+                (outer @ each.reshape(spheres, 3 * count)).reshape(len(outer), 3, count), (2, 0, 1)
+            )
             for each in (force, moment)
         )
         about = turn - xp.linalg.cross(frames.origins, total)
@@ -138,7 +140,8 @@ class Clearance:
             The matrix that adds the forces of P pairs to those of the spheres (S, P); the way from the one of a pair to the
             other (P, 3, N), m; its length (P, N), m; and their distance (P, N), m.
         """
-        flat, count = centre.reshape(len(centre), -1), centre.shape[-1]
+        spheres, _, count = centre.shape
+        flat = centre.reshape(spheres, 3 * count)
         _, select, reach = self._pairs.like(centre)
         if len(select):
             apart = (select @ flat).reshape(-1, 3, count)

@@ -94,7 +94,7 @@ def test_no_joint_is_faster_than_its_own_limit() -> None:
 def test_a_joint_without_velocity_can_teleport_and_not_travel(tmp_path: Path) -> None:
     still = joint_xml(1, limit='<limit lower="-2" upper="1.5" effort="10" velocity="0"/>')
     path = write(tmp_path / "arm.urdf", urdf_xml(joint_xml(0), still))
-    robot = RobotModel.load(path, "link2")
+    robot = RobotModel.inspect(path, "link2")
     assert PinocchioBackend(robot, 1).step(np.ones((1, 2))).q.tolist() == [[1.0, 1.0]]
     with pytest.raises(GymMaraError, match=r"joint joint1 of stick .*limit is 0.*velocity_limit"):
         PinocchioBackend(robot, 1, max_joint_velocity=1.0)

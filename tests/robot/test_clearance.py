@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from gym_mara.collision import make_checker
+from gym_mara.robot import RobotModel
 from gym_mara.robot.clearance import FAR, WIDTH, Clearance
 from gym_mara.testing import pickled, uniform_q
 from gym_mara.types import Floats
-from tests.helpers import robot_model
+from tests.helpers import robot_model, upright_arm, write
 
 ROBOTS = ("mara", "ur5", "panda")
 
@@ -62,3 +66,11 @@ def test_a_copy_gives_the_same_numbers() -> None:
     clearance = Clearance(arm)
     for one, other in zip(clearance(frames), pickled(clearance)(frames), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_an_arm_without_collision_shapes_is_far_from_everything(tmp_path: Path) -> None:
+    text = re.sub("<collision>.*?</collision>", "", upright_arm(), flags=re.S)
+    arm = RobotModel.inspect(write(tmp_path / "arm.urdf", text), "tool")
+    distance, repulsion = Clearance(arm)(arm.kinematics().joint_frames(uniform_q(arm, 5, seed=0)))
+    assert (distance == np.full((5, 3), FAR)).all()
+    assert not repulsion.any()

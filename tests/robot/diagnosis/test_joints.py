@@ -96,12 +96,6 @@ def test_an_arm_of_velocity_0_moves_and_sees_finite_numbers_where_joints_jump(
     env.close()
 
 
-def test_joints_that_travel_need_a_velocity_limit(tmp_path: Path) -> None:
-    robot = RobotModel.inspect(arm_file(tmp_path, FAULTS["velocity 0"][0]), TOOL)
-    with pytest.raises(GymMaraError, match=r"joint j1 .* velocity limit is 0: .* velocity_limit="):
-        make_backend("pinocchio", robot, 1, {"max_joint_velocity": 1.0})
-
-
 def test_no_velocity_limit_is_a_note_where_joints_jump(tmp_path: Path) -> None:
     robot = RobotModel.inspect(arm_file(tmp_path, FAULTS["no velocity"][0]), TOOL)
     (note,) = [f for f in robot.findings if f.message == "no velocity limit" and not f.dynamics]
