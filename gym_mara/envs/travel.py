@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 from gym_mara.backends import backend_settings
 from gym_mara.envs.simulation import Simulation
+from gym_mara.errors import LARGEST, SMALLEST
 
 VELOCITY_LIMIT = "max_joint_velocity"
 """The setting of a backend that limits the velocity of joints."""
@@ -18,7 +17,7 @@ def travel_velocity(simulation: Simulation) -> float | None:
     """
     lowest = float(simulation.robot.velocity_limit.min())
     limited = VELOCITY_LIMIT in backend_settings(simulation.backend_name)
-    if simulation.backend.teleports and limited and 0.0 < lowest < math.inf:
+    if simulation.backend.teleports and limited and SMALLEST <= lowest < LARGEST:
         return lowest
     return None
 
