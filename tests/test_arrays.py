@@ -76,11 +76,9 @@ def _angle_tolerance(a: Floats, b: Floats) -> Floats:
 
 
 def _in_float32(values: Array) -> Array:
-    """The nearest numbers that float32 has as well; of positions, so that their differences are exact: multiples of a micrometre."""
-    if values.dtype == np.bool_:
-        return values
-    grid = 2.0**20 if values.shape[-1] == 3 else 0.0
-    return np.round(values * grid) / grid if grid else values.astype(np.float32).astype(np.float64)
+    """Positions that float32 has as well, so that their differences are exact: multiples of a micrometre. Other values stay."""
+    grid = 2.0**20
+    return np.round(values * grid) / grid if values.shape[-1] == 3 else values
 
 
 def _tensor(value: Any, dtype: torch.dtype) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -11,11 +12,16 @@ from typing import Any
 
 from gym_mara.backends import backend_names, backend_settings
 from gym_mara.envs.actions import ActionSettings
+from gym_mara.envs.given import GIVEN
 from gym_mara.envs.sensors import SensorSettings
 from gym_mara.errors import GymMaraError, one_of, unknown
 from gym_mara.rendering import PixelSettings, RenderSettings
 from gym_mara.robot import RobotLike, RobotModel, RobotOptions
 from gym_mara.tasks import Task, named_task
+
+_ALIKE = 0.85
+"""How alike two names are, as a ratio, if the one is taken for the other misspelt; `randomisation` and `pixel_randomisation` are
+0.81."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,10 @@ class Options:
             owners = [room for room, names in rooms.items() if name in names]
             if not owners:
                 valid = {name for names in rooms.values() for name in names}
+                if name in GIVEN and chosen.random_goal:
+                    raise GymMaraError(
+                        f"this environment draws its targets: give {name!r} to reset, in its options, not to its constructor"
+                    )
                 raise _unknown_keyword(name, valid | _own_names(receiver), backend)
             if len(owners) > 1:
                 raise GymMaraError(
@@ -92,11 +102,17 @@ class Options:
 
 
 def _unknown_keyword(name: str, valid: set[str], backend: str) -> GymMaraError:
-    """The error for a keyword argument that no part of an environment knows."""
-    for other in backend_names():
+    """The error for a keyword argument that no part of an environment knows.
+
+    The other backends are asked only if it is no misspelt name of this environment: that imports their engines.
+    """
+    misspelt = difflib.get_close_matches(name, valid, n=1, cutoff=_ALIKE)
+    for other in () if misspelt else backend_names():
         if other == backend:
             continue
-        with suppress(GymMaraError):  # a backend that is not installed
+        with suppress(
+            Exception
+        ):  # a backend that is not installed, or an engine that cannot be imported
             if name in backend_settings(other):
                 return GymMaraError(
                     f"unknown keyword argument {name!r} with backend {backend!r}: it is a setting of the backend "
