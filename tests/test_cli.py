@@ -15,6 +15,7 @@ import pytest
 import typer
 from rich.console import Console
 
+from gym_mara import __version__
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.agents.evaluation.metrics import METRICS
 from gym_mara.agents.experiments.grid import Grid
@@ -479,3 +480,7 @@ def test_an_interrupt_while_the_arguments_are_read_ends_the_command(
 )
 def test_set_takes_the_words_of_python_and_of_json(text: str, value: object) -> None:
     assert keyword_arguments([f"guide={text}"]) == {"guide": value}
+
+
+def test_the_version_is_printed(gym_mara: Cli) -> None:
+    assert gym_mara("--version")[:2] == (0, f"{__version__}\n")
