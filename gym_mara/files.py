@@ -7,6 +7,7 @@ import os
 import secrets
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -295,6 +296,18 @@ def _publish(temporary: Path, file: Path) -> None:
         if os.path.lexists(file):
             raise _exists(file) from None
         os.replace(temporary, file)
+
+
+def check_new(file: Path) -> None:
+    """Check early that a new file can be made: nothing has its name, and its folder can be written to.
+
+    Raises:
+        GymMaraError: it cannot.
+    """
+    if os.path.lexists(file):
+        raise _exists(file)
+    with writing(file), tempfile.TemporaryFile(dir=file.parent):
+        pass
 
 
 def _exists(file: Path) -> GymMaraError:

@@ -15,12 +15,13 @@ import pytest
 import typer
 from rich.console import Console
 
+from gym_mara import __version__
 from gym_mara.agents.algorithms.registry import ALGORITHMS
 from gym_mara.agents.evaluation.metrics import METRICS
 from gym_mara.agents.experiments.grid import Grid
 from gym_mara.cli import common, experiments
 from gym_mara.cli.app import app
-from gym_mara.cli.common import whole
+from gym_mara.cli.common import keyword_arguments, whole
 from gym_mara.errors import GymMaraError
 from gym_mara.registration import ENVIRONMENTS, Environment, environment_id, environment_names
 from gym_mara.tasks import ReachTask, registry
@@ -464,3 +465,22 @@ def test_an_interrupt_while_the_arguments_are_read_ends_the_command(
     code, _, err = gym_mara("list")
     assert code == 130
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("True", True),
+        ("true", True),
+        ("False", False),
+        ("None", None),
+        ("null", None),
+        ("ur5", "ur5"),
+    ],
+)
+def test_set_takes_the_words_of_python_and_of_json(text: str, value: object) -> None:
+    assert keyword_arguments([f"guide={text}"]) == {"guide": value}
+
+
+def test_the_version_is_printed(gym_mara: Cli) -> None:
+    assert gym_mara("--version")[:2] == (0, f"{__version__}\n")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
+from gym_mara import __version__
 from gym_mara.cli import (
     FAILED,
     agents,
@@ -19,7 +20,7 @@ from gym_mara.cli import (
     training,
     viewing,
 )
-from gym_mara.cli.common import err, interruptible
+from gym_mara.cli.common import err, interruptible, out
 from gym_mara.cli.ros2 import app as ros2
 from gym_mara.errors import GymMaraError
 
@@ -43,6 +44,26 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        out.print(__version__, highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
+
+
 app.command()(training.train)
 app.command()(agents.evaluate)
 app.command()(agents.transfer)

@@ -236,7 +236,7 @@ _OF_VIEWER = frozenset(name for name in _OF_PICTURES if name.startswith("viewer_
 def keyword_arguments(
     settings: list[str], *, pictures: bool = False, viewer: bool = False
 ) -> dict[str, Any]:
-    """Keyword arguments from NAME=VALUE; a value that is not JSON is taken as a string.
+    """Keyword arguments from NAME=VALUE; a value that is not JSON, nor True, False or None, is taken as a string.
 
     Args:
         settings: what `--set` was given.
@@ -269,7 +269,13 @@ def keyword_arguments(
     return options
 
 
+_PYTHON = {"True": True, "False": False, "None": None}
+"""Values that a user of Python writes where JSON has true, false and null."""
+
+
 def _value(setting: str, text: str) -> Any:
+    if text in _PYTHON:
+        return _PYTHON[text]
     try:
         return json.loads(
             text, parse_constant=_refuse_number, parse_int=_integer, parse_float=_finite

@@ -21,7 +21,7 @@ from gym_mara.cli.common import (
 )
 from gym_mara.cli.ros2.options import CommandTopicOption, StateTopicOption
 from gym_mara.errors import GymMaraError, unknown
-from gym_mara.files import write_json
+from gym_mara.files import check_new, write_json
 from gym_mara.identification.fit import identify as fit
 from gym_mara.identification.identified import Identified
 from gym_mara.identification.parameters import DEFAULT, PRIORS
@@ -74,8 +74,8 @@ def identify(
     """
     from gym_mara.ros2.bags.logs import STATES, read_log  # rosbags is optional
 
-    if out_file is not None and out_file.exists():
-        raise GymMaraError(f"{str(out_file)!r} exists and is not overwritten: delete it first")
+    if out_file is not None:
+        check_new(out_file)  # the search takes minutes
     options = keyword_arguments(settings)
     for name in options:
         if name not in (valid := backend_settings(backend)):

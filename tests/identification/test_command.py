@@ -28,3 +28,12 @@ def test_only_settings_of_the_backend_are_taken(
     assert code == 2
     assert re.search(message, error)
     assert "Traceback" not in error
+
+
+def test_a_file_that_cannot_be_written_is_refused_first(tmp_path: Path, gym_mara: Cli) -> None:
+    (tmp_path / "old.json").write_text("mine")
+    for name, message in (("no/x.json", "there is no folder"), ("old.json", "is not overwritten")):
+        code, _, error = gym_mara("identify", tmp_path / "bag", "--out", tmp_path / name)
+        assert code == 2
+        assert message in error
+    assert [entry.name for entry in tmp_path.iterdir()] == ["old.json"]

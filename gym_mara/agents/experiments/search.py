@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -88,11 +89,12 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
     """The study of a search in its folder, new or with the trials so far.
 
     Raises:
-        GymMaraError: a value is wrong, the folder holds another search, its log is damaged, or it cannot be written.
+        GymMaraError: a value is wrong, the folder holds another search or other files, its log is damaged, or it cannot be written.
     """
     search.check()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     start = preset_of(search.config(FIRST_SEED))
+    _check_folder(folder)
     with writing(folder):
         # Resolved because Optuna's lock is a symbolic link, and a relative path would break it.
         folder = folder.resolve()
@@ -120,6 +122,16 @@ def open_study(search: Search, folder: Path) -> optuna.Study:
             f"{str(folder)!r} holds another search, {short(existing)}: choose another --out"
         )
     return study
+
+
+def _check_folder(folder: Path) -> None:
+    """Raises GymMaraError if this is a file, or a folder with files but without the log of a search."""
+    if folder.exists() and not folder.is_dir():
+        raise GymMaraError(f"{str(folder)!r} is a file: choose another --out")
+    if not folder.exists() or os.path.lexists(folder / _LOG):
+        return
+    if any(not entry.name.startswith((".lock", f"{_LOG}.")) for entry in folder.iterdir()):
+        raise GymMaraError(f"{str(folder)!r} holds files but no search: choose another --out")
 
 
 def _check_log(folder: Path) -> None:

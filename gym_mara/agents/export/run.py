@@ -79,7 +79,7 @@ def _about(run: RunFolder, which: str, policy: PolicyDescription, env: MaraVecto
         training=Training(
             algorithm=config.algo,
             preset=config.preset_name,
-            steps=run.trained_steps(),
+            steps=run.policy_steps(which),
             seed=config.seed,
             policy=which,
             backend=config.backend,

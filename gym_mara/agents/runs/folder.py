@@ -119,6 +119,20 @@ class RunFolder:
         checkpoints = self.checkpoints()
         return int(checkpoints[-1].name) if checkpoints else 0
 
+    def policy_steps(self, which: str) -> int:
+        """The steps that the policy "last" or "best" was trained; the best one is that of the first evaluation with the highest reward.
+
+        Raises:
+            DamagedRunError: the table of progress is missing, damaged or without evaluations.
+        """
+        if which == "last":
+            return self.trained_steps()
+        column = "eval/reward_per_step"
+        evaluated = [row for row in read_progress(self.progress_file) if column in row]
+        if not evaluated:
+            raise DamagedRunError(f"the table {str(self.progress_file)!r} has no evaluations")
+        return int(max(evaluated, key=lambda row: row[column])[_STEPS])
+
     def has_policy(self, which: str) -> bool:
         """Whether the run has a policy "last" or "best"."""
         return (self.path / which / "model.zip").is_file()

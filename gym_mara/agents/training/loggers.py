@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
+import re
+import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, TensorBoardOutputFormat
@@ -16,6 +18,7 @@ from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.agents.training import LOGGERS
 from gym_mara.errors import GymMaraError, one_of
 from gym_mara.extras import needs
+from gym_mara.files import DamagedFileError, MissingFileError, read_text, write_text
 
 
 def check_loggers(names: Sequence[str]) -> None:
@@ -97,14 +100,14 @@ class WandbWriter(KVWriter):
         run: the run.
 
     Raises:
-        GymMaraError: the library refuses to begin a run.
+        GymMaraError: the library refuses to begin a run, or wandb.id in the run folder is damaged.
         MissingExtraError: it is not installed.
     """
 
     def __init__(self, run: RunFolder) -> None:
         wandb = _wandb()
         name = run.path.absolute().name
-        identity = hashlib.sha256(str(run.path.absolute()).encode()).hexdigest()[:16]
+        identity = _identity(run.path / "wandb.id")
         try:
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "gym_mara"),
@@ -129,6 +132,20 @@ class WandbWriter(KVWriter):
     def close(self) -> None:
         """Finish the run there."""
         self._run.finish()
+
+
+def _identity(file: Path) -> str:
+    """The id of a run there: random, and kept in a file of the run folder, so that no other run has it."""
+    try:
+        identity = read_text(file, 100).strip()
+    except MissingFileError:
+        identity = secrets.token_hex(8)
+        write_text(file, f"{identity}\n", new=True)
+    if not re.fullmatch(r"[0-9a-f]{16}", identity):
+        raise DamagedFileError(
+            f"{str(file)!r} is damaged: it must be 16 hexadecimal digits; delete it to begin a new run there"
+        )
+    return identity
 
 
 def _wandb() -> Any:

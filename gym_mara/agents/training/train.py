@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import inspect
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
@@ -221,8 +222,13 @@ def new_agent(algo: str, preset: Preset, env: VecEnv, seed: int) -> BaseAlgorith
             "examples/reach_from_pixels.py does"
         )
     use_one_thread()
+    # Rewards are scaled by the returns with the discount factor with which the algorithm learns.
+    default = inspect.signature(algorithm(algo).load_class()).parameters["gamma"].default
     wrapped = VecNormalize(
-        env, norm_obs=preset.normalise_observation, norm_reward=preset.normalise_reward
+        env,
+        norm_obs=preset.normalise_observation,
+        norm_reward=preset.normalise_reward,
+        gamma=preset.arguments.get("gamma", default),
     )
     arguments = {name: _schedule(value) for name, value in preset.arguments.items()}
     arguments["policy_kwargs"] = policy_arguments(preset, env.observation_space)

@@ -11,6 +11,7 @@ import typer
 from gym_mara.backends import make_backend, simulated_backends
 from gym_mara.cli.common import interruptible, keyword_arguments, number, one_of, out
 from gym_mara.cli.ros2.options import DomainOption, RobotOption
+from gym_mara.errors import GymMaraError
 from gym_mara.robot import RobotModel, RobotOptions
 from gym_mara.state import SimState
 
@@ -65,12 +66,14 @@ def sim(
     from gym_mara.ros2.sim.node import SimNode
 
     options = keyword_arguments(settings)
+    if "control_period" in options:
+        raise GymMaraError("--set control_period has no effect here: give --control-period")
     of_robot: dict[str, Any] = {
         name: options.pop(name) for name in vars(RobotOptions()) if name in options
     }
     if "ee_frame" in options:
         of_robot["ee_frame"] = options.pop("ee_frame")
-    options.setdefault("control_period", control_period)
+    options["control_period"] = control_period
     model = RobotModel.load(robot, **of_robot)
     with interruptible("Stopped."), ExitStack() as stack:
         engine = stack.enter_context(closing(make_backend(backend, model, 1, options)))

@@ -36,11 +36,11 @@ from gym_mara.agents.algorithms.registry import (
 from gym_mara.agents.experiments.figures import plot_grid
 from gym_mara.agents.experiments.grid import Grid, open_grid, run_one
 from gym_mara.agents.experiments.search import Search, best_trial, open_study, run_trials
-from gym_mara.agents.runs.evaluation import evaluate_run
+from gym_mara.agents.runs.evaluation import evaluate_run, make_env
 from gym_mara.agents.runs.folder import RunConfig, RunFolder
 from gym_mara.agents.runs.policy import make_network
 from gym_mara.agents.scaling import unit_box
-from gym_mara.agents.training.train import preset_of, train
+from gym_mara.agents.training.train import new_agent, preset_of, train
 from gym_mara.errors import GymMaraError
 from gym_mara.tasks import TASKS, ReachTask
 from tests.agents.conftest import silent
@@ -186,6 +186,17 @@ def test_a_changed_preset_of_a_family_is_another_grid(
             open_grid(tmp_path / "grid", grid)
     with pytest.raises(GymMaraError, match="the 'tuned' presets have changed"):
         open_grid(tmp_path / "grid", grid)
+
+
+@pytest.mark.parametrize(("given", "gamma"), [({"gamma": 0.0}, 0.0), ({}, 0.99)])
+def test_rewards_are_normalised_with_the_discount_factor_of_the_preset(
+    given: dict[str, float], gamma: float
+) -> None:
+    preset = Preset(num_envs=2, normalise_reward=True, arguments={"n_steps": 32, **given})
+    model = new_agent("ppo", preset, make_env("MARA-v0", "pinocchio", 2, {}), seed=0)
+    wrapped = model.get_vec_normalize_env()
+    assert wrapped is not None
+    assert wrapped.gamma == model.gamma == gamma  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("form", ["mlp", "natural"])

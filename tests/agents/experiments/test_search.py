@@ -172,6 +172,15 @@ def test_the_folder_of_another_search_is_refused(tmp_path: Path) -> None:
         open_study(Search(**{**vars(SMALL), "algo": "ppo2"}), tmp_path / "other")
 
 
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(GymMaraError, match="holds files but no search: choose another --out"):
+        open_study(SMALL, tmp_path)
+    with pytest.raises(GymMaraError, match="is a file: choose another --out"):
+        open_study(SMALL, tmp_path / "config.json")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["config.json"]
+
+
 @pytest.mark.parametrize("env", ["MARA-v0", "MARAReach-v0"])
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_search_starts_with_the_preset_of_the_environment(

@@ -131,8 +131,15 @@ def test_the_metadata_tell_where_the_policy_comes_from(exported: OnnxPolicy) -> 
 
 
 def test_the_best_policy_is_another_file(finished_run: RunFolder, tmp_path: Path) -> None:
-    about = export(finished_run, tmp_path / "best.onnx", which="best")
-    assert about.training.policy == "best"
+    run = RunFolder(shutil.copytree(finished_run.path, tmp_path / "run"), finished_run.config)
+    text = run.progress_file.read_text()
+    titles = text.splitlines()[0].split(",")
+    row = {"time/total_timesteps": ROLLOUT, "eval/reward_per_step": 10.0}
+    added = ",".join(str(row.get(title, "")) for title in titles)
+    run.progress_file.write_text(f"{text}{added}\n")
+    about = export(run, tmp_path / "best.onnx", which="best")
+    assert (about.training.policy, about.training.steps) == ("best", ROLLOUT)
+    assert RunFolder(run.path, run.config).policy_steps("last") == 3 * ROLLOUT
 
 
 def test_paths_of_the_machine_are_not_exported(tmp_path: Path) -> None:

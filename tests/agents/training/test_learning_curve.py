@@ -43,6 +43,18 @@ def test_only_the_tasks_of_the_paper_have_a_line_at_their_best_reward(
     assert len(drawn[0].axes[0].lines) == lines
 
 
+def test_a_task_without_a_position_error_has_no_panel_for_it(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    monkeypatch.setattr(module, "written_aside", contextlib.nullcontext)
+    plot_learning_curve(run)
+    run.progress_file.write_text(PROGRESS.replace("position_error_mm", "angle_deg"))
+    plot_learning_curve(run)
+    assert [len(figure.axes) for figure in drawn] == [2, 1]
+
+
 def test_a_file_size_limit_leaves_the_old_picture(run: RunFolder, small_files: None) -> None:
     picture = run.path / "learning_curve.png"
     picture.write_text("old")

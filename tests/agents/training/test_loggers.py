@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from gym_mara.agents.runs.folder import read_progress
+from gym_mara.agents.runs.folder import RunFolder, read_progress
 from gym_mara.agents.training import loggers
 from gym_mara.agents.training.train import resume, train
 from gym_mara.errors import GymMaraError, MissingExtraError
@@ -75,6 +76,24 @@ def test_weights_and_biases_gets_the_rows_of_the_table_and_goes_on_when_resumed(
     assert wandb.logged[-1][1]["eval/reward_per_step"] == pytest.approx(
         rows[-1]["eval/reward_per_step"]
     )
+
+
+def test_each_run_has_its_own_id_in_weights_and_biases_wherever_its_folder_is(
+    tmp_path: Path, wandb: Wandb
+) -> None:
+    for folder in ("first", "second"):
+        (tmp_path / folder).mkdir()
+        loggers.WandbWriter(RunFolder(tmp_path / folder, config()))
+    shutil.move(tmp_path / "first", tmp_path / "moved")
+    loggers.WandbWriter(RunFolder(tmp_path / "moved", config()))
+    (tmp_path / "first").mkdir()  # a new run in the place of one that was deleted
+    loggers.WandbWriter(RunFolder(tmp_path / "first", config()))
+    first, second, moved, again = (begun["id"] for begun in wandb.begun)
+    assert moved == first
+    assert len({first, second, again}) == 3
+    (tmp_path / "first" / "wandb.id").write_text("../other")
+    with pytest.raises(GymMaraError, match=r"wandb\.id' is damaged"):
+        loggers.WandbWriter(RunFolder(tmp_path / "first", config()))
 
 
 def test_a_refusal_of_weights_and_biases_is_an_error_in_plain_words(

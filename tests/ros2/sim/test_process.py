@@ -100,3 +100,8 @@ def test_a_browser_can_show_it(ros_domain: int) -> None:
         address = next(line for line in process.stdout if line.startswith("view: ")).split()[-1]
         with urllib.request.urlopen(address, timeout=10.0) as response:
             assert response.status == 200
+
+
+def test_the_control_period_has_one_option(gym_mara: Cli) -> None:
+    code, _, error = gym_mara("ros2", "sim", "--set", "control_period=0.01", "--seconds", "0.1")
+    assert (code, "give --control-period" in error) == (2, True)
