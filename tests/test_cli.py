@@ -484,3 +484,13 @@ def test_set_takes_the_words_of_python_and_of_json(text: str, value: object) -> 
 
 def test_the_version_is_printed(gym_mara: Cli) -> None:
     assert gym_mara("--version")[:2] == (0, f"{__version__}\n")
+
+
+def test_a_hyperparameter_is_no_keyword_argument_of_the_environment(
+    gym_mara: Cli, tmp_path: Path
+) -> None:
+    train = ("train", "--steps", "1", "--out", tmp_path / "run", "--set")
+    code, _, error = gym_mara(*train, "learning_rate=0.1")
+    assert (code, "Hyperparameters are presets: give --preset" in error) == (2, True)
+    code, printed, error = gym_mara(*train, "gamma=-1")
+    assert (code, "gamma is a constant of the reward here" in printed) == (2, True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gym_mara.agents.algorithms.registry import DEFAULT_ALGORITHM, DEFAULT_PRESET
+from gym_mara.agents.algorithms.registry import ALGORITHMS, DEFAULT_ALGORITHM, DEFAULT_PRESET
 from gym_mara.agents.training import DEFAULT_LOGGERS, LOGGERS
 from gym_mara.cli.agents import print_metrics
 from gym_mara.cli.common import (
@@ -35,7 +35,8 @@ from gym_mara.cli.common import (
 )
 from gym_mara.cli.policies import PolicyOption
 from gym_mara.errors import GymMaraError
-from gym_mara.registration import file_name, own_backend
+from gym_mara.registration import environment, file_name, own_backend
+from gym_mara.tasks import named_task
 
 if TYPE_CHECKING:
     from gym_mara.agents.runs.folder import RunConfig
@@ -117,6 +118,13 @@ def train(
             given = {k: v for k, v in chosen.items() if is_given(context, k.removesuffix("_name"))}
             source = RunFolder.open(start)
             config = started_from(source, from_policy, options, **given, **numbers)
+        for name in options:
+            _refuse_hyperparameter(name, config.env)
+        if "gamma" in options:
+            out.print(
+                "note: gamma is a constant of the reward here; the discount factor is a part of the preset.",
+                soft_wrap=True,
+            )
         folder = out_folder or _default_folder(config)
         with _progress(config.steps, folder) as on_progress:
             run = start_training(config, folder, on_progress, log=loggers)
@@ -125,6 +133,17 @@ def train(
     if (trained := run.trained_steps()) > run.config.steps:
         out.print(f"Trained {trained:,} steps: an update needs a whole rollout of all arms.")
     out.print(f"Run folder: {run.path}", soft_wrap=True)
+
+
+def _refuse_hyperparameter(name: str, env: str) -> None:
+    """Raises GymMaraError if this name is a hyperparameter of the algorithms' presets, and none of the environment's task."""
+    own = vars(named_task(environment(env).task)).keys()
+    presets = [p for entry in ALGORITHMS.values() for v in entry.presets.values() for p in v[:2]]
+    if name in {key for preset in presets for key in preset.arguments} - own:
+        raise GymMaraError(
+            f"--set {name}: it is a hyperparameter of the algorithm, and --set takes keyword arguments of the environment. "
+            "Hyperparameters are presets: give --preset, or train with gym_mara.agents.training.train.preset_agent"
+        )
 
 
 def _default_folder(config: RunConfig) -> Path:
