@@ -135,6 +135,22 @@ def test_forked_processes_draw_by_ray_casting_after_their_parent_has_drawn(rende
     cast.close()
 
 
+def test_embree_has_no_threads_whose_locks_a_fork_could_copy() -> None:
+    code = (
+        "import os\n"
+        "from gym_mara.envs import MaraEnv\n"
+        "env = MaraEnv(render_mode='rgb_array', renderer='raycast', width=64, height=48)\n"
+        "env.reset(seed=0)\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "env.render()\n"
+        "print(len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout == "1\n"  # the drawing thread
+
+
 @forks
 def test_a_forked_process_cannot_use_the_opengl_of_its_parent() -> None:
     env = drawable("vtk")

@@ -9,6 +9,7 @@ trimesh also casts rays with Embree, but does not return where in a triangle a r
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,14 @@ from gym_mara.types import Floats, Mask
 with needs("the renderer 'raycast'", "render", "embreex"):
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
+
+if hasattr(os, "sched_setaffinity"):
+    # Embree's scheduler, TBB, gets as many threads as the main thread may use processors when the first scene is made. It gets none
+    # of its own here: a fork while one works would copy the lock that it holds, and the first picture of the new process would never end.
+    _main, _processors = os.getpid(), os.sched_getaffinity(os.getpid())
+    os.sched_setaffinity(_main, {min(_processors)})
+    EmbreeScene()
+    os.sched_setaffinity(_main, _processors)
 
 Float32s = NDArray[np.float32]
 Int32s = NDArray[np.int32]
