@@ -142,7 +142,12 @@ def test_the_pace_of_an_arm_that_collided_does_not_depend_on_resets_of_others() 
 
 def test_the_guide_leads_to_the_target_and_follows_it() -> None:
     envs = MaraVectorEnv(
-        20, "MARAPose-v0", guide=True, max_joint_velocity=1.57, on_collision="continue"
+        20,
+        "MARAPose-v0",
+        guide=True,
+        max_joint_velocity=1.57,
+        on_collision="continue",
+        max_episode_steps=None,
     )
     envs.reset(seed=0)
     simulation = envs.simulation
