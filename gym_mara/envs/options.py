@@ -110,9 +110,7 @@ def _unknown_keyword(name: str, valid: set[str], backend: str) -> GymMaraError:
     for other in () if misspelt else backend_names():
         if other == backend:
             continue
-        with suppress(
-            Exception
-        ):  # a backend that is not installed, or an engine that cannot be imported
+        with suppress(Exception):  # it is not installed, or its engine cannot be imported
             if name in backend_settings(other):
                 return GymMaraError(
                     f"unknown keyword argument {name!r} with backend {backend!r}: it is a setting of the backend "

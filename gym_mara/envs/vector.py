@@ -253,9 +253,8 @@ class MaraVectorEnv(VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
         _add_rows(info, begun, everyone)
         self._ended = xp.zeros_like(everyone)
         self._last = xp.asarray(observation, copy=True)
-        reward, terminated, truncated = (
-            xp.zeros_like(v) for v in (observation[:, 0], *2 * [everyone])
-        )
+        reward = xp.zeros_like(observation[:, 0])
+        terminated, truncated = xp.zeros_like(everyone), xp.zeros_like(everyone)
         return simulation.present(observation), reward, terminated, truncated, info
 
     def _begin_next(

@@ -128,7 +128,10 @@ def _draw(
     algos: Sequence[str],
     curves: dict[str, list[dict[str, float]]],
 ) -> Path:
-    """Mean reward against steps, of an episode for the paper's tasks and per step for others; a colour for each algorithm; one that is alone also has a line for each seed."""
+    """Mean reward against steps: of an episode for the paper's tasks, per step for others.
+
+    Each algorithm has a colour. One that is alone also has a line for each seed.
+    """
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     axis = figure.subplots()
     steps = np.linspace(0, grid.steps, _POINTS + 1)[1:]
