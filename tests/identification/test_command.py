@@ -9,8 +9,6 @@ import pytest
 
 from tests.helpers import Cli
 
-pytest.importorskip("rosbags")
-
 
 @pytest.mark.parametrize(
     ("setting", "message"),

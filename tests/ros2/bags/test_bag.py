@@ -7,9 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rosbags")
-
 from rosbags.rosbag2 import Reader
 from rosbags.typesys.stores import ros2_jazzy as types
 

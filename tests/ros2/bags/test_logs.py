@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-pytest.importorskip("rosbags")
-
 from rosbags.typesys.stores import ros2_jazzy as types
 
 from gym_mara.envs import MaraEnv

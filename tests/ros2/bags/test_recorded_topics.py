@@ -6,10 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy")
-pytest.importorskip("rosbags")
-
 from rosbags.typesys.stores import ros2_jazzy as types
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String

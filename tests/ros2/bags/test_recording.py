@@ -11,9 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy")
-pytest.importorskip("rosbags")
-
 from gym_mara.errors import GymMaraError
 from gym_mara.ros2.bags import recording
 from gym_mara.ros2.bags.bag import Bag
